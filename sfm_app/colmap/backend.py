@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap as pycolmap
 
 from sfm_app.errors import BackendError, NumericalError, SfmError
-from sfm_app.numerical import FAILURES, Json, error_reason
+from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.operating_system import keep_handler
 from sfm_app.progress import Progress
 
@@ -196,13 +196,3 @@ def run_with_progress(
         poll()
     finally:
         progress.finish()
-
-
-def json_options(options: Mapping[object, object]) -> dict[str, Json]:
-    """Return COLMAP's options as JSON values; the manifest records all of them."""
-    return {
-        str(key): json_options(value)
-        if isinstance(value, dict)
-        else (value if isinstance(value, bool | int | float | str) else str(value))
-        for key, value in options.items()
-    }

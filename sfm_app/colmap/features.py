@@ -21,11 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sfm_app.colmap.backend import json_options, pycolmap, run_with_progress, translate_errors
+from sfm_app.colmap.backend import pycolmap, run_with_progress, translate_errors
 from sfm_app.colmap.database import open_database, panorama_names
 from sfm_app.colmap.worker_process import ProcessGroup, ProgressReporter, SiftOption
 from sfm_app.files import replace_atomically
-from sfm_app.numerical import Json
 from sfm_app.photos.decode import read_picture, upright_image
 from sfm_app.photos.masks import read_mask
 from sfm_app.progress import Progress, SilentProgress, track
@@ -49,10 +48,8 @@ Extract = Callable[[Path, Sequence[str], pycolmap.FeatureExtractionOptions, pyco
 """Lets COLMAP enter features of photos with these names in a database, which exists."""
 
 
-def find_sift(
-    database: Path, settings: SiftSettings, names: Sequence[str], workers: int, progress: Progress
-) -> dict[str, Json]:
-    """Find features of photos that have none yet, and return the effective options, for the manifest."""
+def find_sift(database: Path, settings: SiftSettings, names: Sequence[str], workers: int, progress: Progress) -> None:
+    """Find features of photos that have none yet."""
     extraction = _extraction_options(settings, workers)
     panoramas = panorama_names(database)
     extract_panoramas(database, settings, [name for name in names if name in panoramas], extraction, progress)
@@ -85,7 +82,6 @@ def find_sift(
         _run_with_progress(
             call, database, lambda one: sum(map(one.exists_keypoints, ids)), "features", len(ids), progress
         )
-    return {"extraction": json_options(extraction.todict())}
 
 
 def _extraction_options(settings: SiftSettings, workers: int) -> pycolmap.FeatureExtractionOptions:
@@ -221,8 +217,8 @@ def _find_in_panorama(
 # Raw matches.
 
 
-def match_sift(database: Path, options: MatchSettings, pairs: Sequence[PairId], progress: Progress) -> dict[str, Json]:
-    """Match pairs of photos on one thread in a scratch database, and return the effective options.
+def match_sift(database: Path, options: MatchSettings, pairs: Sequence[PairId], progress: Progress) -> None:
+    """Match pairs of photos on one thread in a scratch database.
 
     The photos get their ids as names: COLMAP's lists of pairs hold plain ASCII, and end names at blanks.
     """
@@ -248,7 +244,6 @@ def match_sift(database: Path, options: MatchSettings, pairs: Sequence[PairId], 
     pairing.match_list_path = database.with_name("pairs.txt")
     pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="ascii", newline="\n")
     _run_with_progress(call, database, count, "matching", len(pairs), progress)
-    return {"matching": json_options(matching.todict())}
 
 
 def _run_with_progress(
@@ -294,8 +289,6 @@ class Part:
     path: Path
     count: int
     """Photos or pairs of which no progress has been shown."""
-    in_force: Mapping[str, Json]
-    """COLMAP's options."""
 
 
 PHOTOS_ONLY, WITH_FEATURES = "photos.db", "features.db"
@@ -323,8 +316,8 @@ def _write_snapshot(database: Path, target: Path, without: Sequence[str]) -> Non
 def find_in_chunk(inputs: SiftInputs, names: Sequence[str]) -> Part:
     """Find features of some photos, and leave their rows in a file."""
     with translate_errors("finding features"), _scratch_copy(inputs) as database:
-        in_force = find_sift(database, inputs.settings, names, 1, SilentProgress())
-        return Part(_leave_rows(database, FEATURES, inputs.folder), len(names), in_force)
+        find_sift(database, inputs.settings, names, 1, SilentProgress())
+        return Part(_leave_rows(database, FEATURES, inputs.folder), len(names))
 
 
 def match_chunk(inputs: SiftInputs, pairs: Sequence[PairId], progress: Progress | None = None) -> Part:
@@ -332,8 +325,8 @@ def match_chunk(inputs: SiftInputs, pairs: Sequence[PairId], progress: Progress 
     photos = sorted({photo for pair in pairs for photo in pair})
     with translate_errors("matching photos"), _MATCHING, _scratch_copy(inputs) as database:
         _copy_rows(database, inputs.folder / WITH_FEATURES, FEATURES, photos)
-        in_force = match_sift(database, inputs.settings.options, pairs, progress or SilentProgress())
-        return Part(_leave_rows(database, MATCHES, inputs.folder), len(pairs), in_force)
+        match_sift(database, inputs.settings.options, pairs, progress or SilentProgress())
+        return Part(_leave_rows(database, MATCHES, inputs.folder), len(pairs))
 
 
 def match_chunk_apart(inputs: SiftInputs, group: ProcessGroup, progress: Progress, pairs: Sequence[PairId]) -> Part:

@@ -41,11 +41,12 @@ def open_points(path: Path) -> NDArray[np.void]:
         return np.memmap(path, np.dtype(fields), "r", start, (count,))
 
 
-def write_points(records: NDArray[np.void], path: Path) -> None:
-    """Write records (N,) with the fields of `open_points` as a PLY file."""
+def write_points(parts: Sequence[NDArray[np.void]], path: Path) -> None:
+    """Write records (N,) of the same fields, as of `open_points`, one after the other as a PLY file."""
     with path.open("wb") as file:
-        file.write(_header(records.dtype, len(records)))
-        file.write(np.ascontiguousarray(records).tobytes())
+        file.write(_header(parts[0].dtype, sum(map(len, parts))))
+        for part in parts:
+            file.write(np.ascontiguousarray(part).tobytes())
 
 
 def _header(fields: np.dtype[np.void], count: int) -> bytes:
@@ -53,15 +54,6 @@ def _header(fields: np.dtype[np.void], count: int) -> bytes:
     properties = [f"property {kinds[kind[0].kind]} {name}" for name, kind in (fields.fields or {}).items()]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header", ""]
     return "\n".join(lines).encode("ascii")
-
-
-def join_points(parts: Sequence[Path], target: Path) -> None:
-    """Write the points of several files with the same fields into one, without holding them all."""
-    records = [open_points(path) for path in parts]
-    with target.open("wb") as file:
-        file.write(_header(records[0].dtype, sum(map(len, records))))
-        for part in records:
-            file.write(np.ascontiguousarray(part).tobytes())
 
 
 def positions(records: NDArray[np.void]) -> NDArray[np.float64]:

@@ -256,7 +256,7 @@ class _Execution:
         """Return the product of a stage, after checking that photos and output folder did not change."""
         photos = self.pipeline.photos
         try:
-            with self.open_workers(run) as own:
+            with run.with_workers(run.workers) as own:
                 product = stage.make(self.products, own)
             used = product if isinstance(product, PhotoSet) else self.products[photos]
             check_undisturbed(self.source, used, run)
@@ -265,16 +265,6 @@ class _Execution:
             check_undisturbed(self.source, None if stage is photos else self.products[photos], run, by=err)
             raise
         return product
-
-    @contextmanager
-    def open_workers(self, run: RunContext) -> Iterator[RunContext]:
-        """Provide workers for one stage; on failure, cancel the stage's remaining tasks."""
-        with run.with_workers(run.workers) as own:
-            try:
-                yield own
-            except BaseException:
-                own.executor.shutdown(wait=False, cancel_futures=True)
-                raise
 
 
 def spread_reasons(

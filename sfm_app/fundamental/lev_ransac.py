@@ -111,10 +111,6 @@ def _optimize_locally(points: FloatArray, F: FloatArray, threshold: float) -> Fl
     return F
 
 
-def _refit_by_likelihood(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    return refine_mixture(points, F, threshold=threshold, reach=OPTIONS.final_reach, most_steps=OPTIONS.final_steps)
-
-
 PRODUCTION = Recipe(
     score=partial(geman_mcclure, scale=OPTIONS.coarse),
     fine_score=partial(geman_mcclure, scale=OPTIONS.fine),
@@ -128,7 +124,7 @@ PRODUCTION = Recipe(
     oriented=True,
     improve=_optimize_locally,
     recover=recover_epipole,
-    finish=_refit_by_likelihood,
+    finish=partial(refine_mixture, reach=OPTIONS.final_reach, most_steps=OPTIONS.final_steps),
 )
 """Shares, batch and patience were chosen on the Strecha sets, on synthetic pairs of thesis 4.8 and on pairs with two
 motions (benchmarks/README.md)."""

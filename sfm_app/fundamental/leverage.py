@@ -11,7 +11,7 @@ linearly (and A f is small): one well-scaled frame (`points.Matches`) gives the 
 
 import numpy as np
 
-from sfm_app.fundamental.scores import select, squared_distances
+from sfm_app.fundamental.scores import squared_distances
 from sfm_app.fundamental.solvers import quadratic_forms, weighted_gram
 from sfm_app.jit import kernel
 from sfm_app.numerical import MAD_TO_SIGMA
@@ -107,11 +107,8 @@ def priors(distances: FloatArray, sigma: float) -> FloatArray:
 @kernel
 def mad_sigma(distances: FloatArray) -> float:
     """Return the standard deviation about zero from the median absolute deviation (thesis 4.7.3)."""
-    count = distances.shape[0]
-    deviations = np.empty(count)
-    for i in range(count):
-        deviations[i] = abs(distances[i])
-    return MAD_TO_SIGMA * select(deviations, count // 2) if count > 0 else 0.0
+    middle = distances.shape[0] // 2
+    return float(MAD_TO_SIGMA * np.partition(np.abs(distances), middle)[middle]) if len(distances) else 0.0
 
 
 def prior_validity(points: FloatArray, f: FloatArray, threshold: float, *, sigma_from_inliers: bool) -> FloatArray:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_app.fundamental.points import Matches
-from sfm_app.fundamental.pretests import LENIENCE, NO_PRETEST, AdaptivePreTest, FullScoring, PreTest
+from sfm_app.fundamental.pretests import LENIENCE, NO_PRETEST, FullScoring, PreTest
 from sfm_app.fundamental.samples import (
     SAMPLE_SIZE,
     RandomState,
@@ -50,7 +50,7 @@ class Recipe:
     """Samples between two checks for a better model."""
     warmup_share: float = 0.0
     """Share of the trials before the first priors."""
-    pretest: Callable[[int, int], AdaptivePreTest] = FullScoring
+    pretest: Callable[[int, int], FullScoring] = FullScoring
     """(number of matches, sample size) -> the pre-test of hypotheses."""
     assumed_share: float | None = None
     """Share of inliers for the number of trials (thesis 3.19); None: that of the best model."""

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,14 +45,18 @@ NO_PRETEST = make_pretest(np.zeros(0, dtype=np.int64), BLOCK, random_start=False
 """No pre-test: every hypothesis is scored in full, or until it cannot win."""
 
 
-class AdaptivePreTest(Protocol):
-    """A pre-test that adapts during a search, and the number of trials that allows for its errors."""
+class FullScoring:
+    """No pre-test: all hypotheses are scored on all matches. Other pre-tests adapt during a search."""
 
+    review = 2**62
+    """Largest number of trials between two calls of `learn`."""
     pretest: PreTest
     lenient: PreTest
     """Pre-test of models from samples drawn without the priors."""
-    review: int
-    """Largest number of trials between two calls of `learn`."""
+
+    def __init__(self, count: int, sample_size: int) -> None:
+        self.count, self.sample_size = count, sample_size
+        self.pretest = self.lenient = NO_PRETEST
 
     def learn(self, trials: int) -> None:
         """Count samples that were drawn and pre-tested."""
@@ -62,25 +66,6 @@ class AdaptivePreTest(Protocol):
 
     def required_trials(self, share: float, confidence: float) -> float:
         """Return how many samples, drawn ones included, give a clean one that passes with probability `confidence`."""
-
-
-class FullScoring:
-    """No pre-test: all hypotheses are scored on all matches."""
-
-    review = 2**62
-
-    def __init__(self, count: int, sample_size: int) -> None:
-        self.count, self.sample_size = count, sample_size
-        self.pretest = self.lenient = NO_PRETEST
-
-    def learn(self, trials: int) -> None:
-        """Do nothing: the pre-test does not depend on the samples."""
-
-    def expect(self, share: float) -> None:
-        """Do nothing: the pre-test does not depend on the share of inliers."""
-
-    def required_trials(self, share: float, confidence: float) -> float:
-        """Return how many samples give a clean one with this probability."""
         return required_trials(share**self.sample_size, confidence)
 
 
@@ -220,20 +205,20 @@ def design(epsilon: float, delta: float, sample_size: int) -> SequentialTest:
     return SequentialTest(epsilon, delta, math.log(threshold))
 
 
-class Sprt:
+class Sprt(FullScoring):
     """The test as an adaptive pre-test, designed again when the estimate of epsilon or delta changes."""
 
     review = SPRT.review
 
     def __init__(self, count: int, sample_size: int) -> None:
-        self._count, self._sample_size = count, sample_size
+        super().__init__(count, sample_size)
         self._rejected = np.zeros(2, dtype=np.int64)
         self._past: list[tuple[SequentialTest, int]] = []
         self._begin(SPRT.first_epsilon, SPRT.first_delta)
 
     def _begin(self, epsilon: float, delta: float) -> None:
-        self._test, self._trials = design(epsilon, delta, self._sample_size), 0
-        self.pretest = self.lenient = PreTest(self._test.least_inliers(self._count), 1, True, self._rejected)
+        self._test, self._trials = design(epsilon, delta, self.sample_size), 0
+        self.pretest = self.lenient = PreTest(self._test.least_inliers(self.count), 1, True, self._rejected)
 
     def _renew(self, epsilon: float) -> None:
         self._past.append((self._test, self._trials))
@@ -256,7 +241,7 @@ class Sprt:
 
     def required_trials(self, share: float, confidence: float) -> float:
         """Return the number of samples by (3.19); each test so far passed clean samples with its own probability."""
-        clean = share**self._sample_size
+        clean = share**self.sample_size
         missed, drawn = 0.0, 0  # log-probability that all samples so far were contaminated, or clean but rejected
         for test, trials in self._past:
             # with a share of 1, past samples would be certain successes

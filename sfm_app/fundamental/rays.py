@@ -16,6 +16,7 @@ from sfm_app.fundamental.degeneracy import DEGENERACY
 from sfm_app.fundamental.estimate import CHANCE, NO_MODEL, TOO_FEW_INLIERS, TOO_FEW_MATCHES
 from sfm_app.fundamental.lev_ransac import OPTIONS as LEV_RANSAC
 from sfm_app.fundamental.leverage import cook_distances, mad_sigma, priors, studentized_residuals
+from sfm_app.fundamental.samples import required_trials
 from sfm_app.fundamental.solvers import RAY_SAMPLE_SIZE, solve_five_point
 from sfm_app.geometry.epipolar import (
     FIRST,
@@ -124,11 +125,8 @@ def _search(lines: FloatArray, options: EpipolarSettings, rng: np.random.Generat
         if cost < lowest:
             best, lowest, chances = optimized, cost, validity(lines, optimized, threshold)
             share = float(np.mean(squared_distances(optimized[None], lines)[0] <= threshold**2))
-            limit = min(
-                options.max_trials,
-                OPTIONS.most_trials,
-                max(OPTIONS.least_trials, _samples_needed(share, options.confidence)),
-            )
+            needed = max(OPTIONS.least_trials, required_trials(share**RAY_SAMPLE_SIZE, options.confidence))
+            limit = math.ceil(min(options.max_trials, OPTIONS.most_trials, needed))
     return best, trials
 
 
@@ -153,12 +151,6 @@ def _optimize_locally(lines: FloatArray, E: FloatArray, threshold: float) -> Flo
 
 def _costs(squared: FloatArray, scale: float) -> FloatArray:
     return np.asarray(squared / (squared + scale**2), np.float64)
-
-
-def _samples_needed(share: float, confidence: float) -> int:
-    """Return the samples after which one of them is all inliers with this probability (thesis 3.19)."""
-    good = share**RAY_SAMPLE_SIZE
-    return math.ceil(math.log(1.0 - confidence) / math.log1p(-good)) if 0.0 < good < 1.0 else 1
 
 
 def _mismatch_distances(E: FloatArray, lines: FloatArray) -> FloatArray:

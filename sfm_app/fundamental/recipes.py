@@ -5,9 +5,9 @@ The threshold T is `max_error_px`; the thesis takes 1.96 px for a noise of 1 px.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 
@@ -70,21 +70,8 @@ RECIPES: Mapping[str, tuple[Recipe, str]] = {
 LMedS assumes half outliers (4.4.1)."""
 
 
-class RecipeEstimator:
-    """The estimator of a name in `RECIPES`, as a function that can be pickled."""
-
-    def __init__(self, name: str) -> None:
-        self.__name__ = name
-
-    def __call__(self, x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
-        return fit_by_recipe(x1, x2, options, seed, RECIPES[self.__name__][0])
-
-    def __reduce__(self) -> tuple[Callable[[str], "RecipeEstimator"], tuple[str]]:
-        """Pickle by name, as functions are: a worker process looks up its own instance."""
-        return recipe_estimator, (self.__name__,)
-
-
-@cache
-def recipe_estimator(name: str) -> RecipeEstimator:
-    """Return the estimator of a name in `RECIPES`, always the same object."""
-    return RecipeEstimator(name)
+def fit_by_name(
+    name: str, x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int
+) -> EpipolarFit | Rejected:
+    """Run the estimator of a name in `RECIPES`, see `fit_by_recipe`; a `partial` of it can be pickled."""
+    return fit_by_recipe(x1, x2, options, seed, RECIPES[name][0])

@@ -146,7 +146,7 @@ def refine_sampson(
     return _reweighted_least_squares(points, *factorize(F), weighing, most_steps, tolerance, np.empty((10, 10)))
 
 
-def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach: float, most_steps: int) -> FloatArray:
+def refine_mixture(points: FloatArray, F: FloatArray, threshold: float, *, reach: float, most_steps: int) -> FloatArray:
     """Estimate F with the sigma and share of inliers by maximum likelihood: EM (thesis 3.5 and 4.6).
 
     Among the matches within `reach` > 1 thresholds, signed distances of inliers are Gaussian about 0, with a sigma of

@@ -183,30 +183,7 @@ def _median_of_squares(points: FloatArray, f: FloatArray, to_beat: float) -> flo
         may_miss -= squared[i] >= to_beat
         if may_miss < 0:
             return np.inf
-    return select(squared, count // 2)
-
-
-@kernel
-def select(values: FloatArray, rank: int) -> float:
-    """Return the value that sorting would put at `rank` (0: smallest), by Hoare's quickselect; reorder `values`."""
-    low, high = 0, values.shape[0] - 1
-    while low < high:
-        pivot, i, j = values[(low + high) // 2], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i, j = i + 1, j - 1
-        if rank <= j:
-            high = j
-        elif rank >= i:
-            low = i
-        else:
-            return float(values[rank])
-    return float(values[rank])
+    return float(np.partition(squared, count // 2)[count // 2])
 
 
 # MLESAC: the likelihood of F under Gaussian inliers and uniform outliers (Torr and Zisserman 2000; thesis 3.5, 4.6).

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfm_app.errors import NumericalError
+from sfm_app.geometry.poses import normalize
 from sfm_app.types.arrays import FloatArray
 
 
@@ -65,9 +66,9 @@ def eight_point(x1: ArrayLike, x2: ArrayLike, weights: ArrayLike | None = None) 
 
 
 def nearest_rank_two(F: ArrayLike) -> FloatArray:
-    """Return the matrix of rank 2 that is nearest to F in the Frobenius norm (thesis 4.2)."""
+    """Return the matrices of rank 2 that are nearest to F (..., 3, 3) in the Frobenius norm (thesis 4.2)."""
     U, s, Vt = np.linalg.svd(np.asarray(F, dtype=np.float64))
-    rank_two: FloatArray = (U[:, :2] * s[:2]) @ Vt[:2]
+    rank_two: FloatArray = (U[..., :2] * s[..., None, :2]) @ Vt[..., :2, :]
     return rank_two
 
 
@@ -345,9 +346,7 @@ def fit_rays(p: FloatArray, q: FloatArray, weights: FloatArray | None = None) ->
     rows = (q[..., :, None] * p[..., None, :]).reshape(*p.shape[:-1], 9)
     weighted = rows if weights is None else rows * weights[..., None]
     _, vectors = np.linalg.eigh(np.swapaxes(weighted, -1, -2) @ rows)
-    U, s, Vt = np.linalg.svd(vectors[..., :, 0].reshape(*rows.shape[:-2], 3, 3))
-    s[..., 2] = 0.0
-    return np.asarray((U * s[..., None, :]) @ Vt, np.float64)
+    return nearest_rank_two(vectors[..., :, 0].reshape(*rows.shape[:-2], 3, 3))
 
 
 def depths(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -372,7 +371,7 @@ def pixels_per_radian(lines: FloatArray) -> float:
 
 def rotation_residuals(lines: FloatArray, R: FloatArray) -> FloatArray:
     """Return residuals (N,), in px of view 2, of the rotation near R that explains most matches (robust Kabsch)."""
-    h1, h2 = (_normalize(lines[:, view]) for view in (FIRST, SECOND))
+    h1, h2 = (normalize(lines[:, view]) for view in (FIRST, SECOND))
     focal = pixels_per_radian(lines.reshape(-1, 9))
     for _ in range(10):
         distances = focal * np.linalg.norm(h1 @ R.T - h2, axis=1)
@@ -380,10 +379,6 @@ def rotation_residuals(lines: FloatArray, R: FloatArray) -> FloatArray:
         U, _, Vt = np.linalg.svd(np.einsum("ni,nj->ij", h2 * weights[:, None], h1))
         R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
     return np.asarray(focal * np.linalg.norm(h1 @ R.T - h2, axis=1), np.float64)
-
-
-def _normalize(h: FloatArray) -> FloatArray:
-    return np.asarray(h / np.linalg.norm(h, axis=1, keepdims=True), np.float64)
 
 
 GOOD_ANGLE_DEG = 12.0

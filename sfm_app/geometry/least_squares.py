@@ -47,16 +47,20 @@ OPTIONS = SystemOptions()
 NOT_FINITE = "a matrix has infinite or NaN entries", "this is a bug; please report it with OUT/log.txt"
 
 
-def lift_eigenvalues(S: FloatArray, least: float = EIGENVALUE_FLOOR, to: float = EIGENVALUE_FLOOR) -> FloatArray:
+def lift_eigenvalues(
+    S: FloatArray, least: float = EIGENVALUE_FLOOR, to: float = EIGENVALUE_FLOOR, scale: FloatArray | None = None
+) -> FloatArray:
     """Lift eigenvalues below `least` to `to`, in [least, 1]; matrices (..., n, n) without any are returned unchanged.
 
     Eigenvalues are those of the matrix scaled to a unit diagonal, so that units do not matter. With `to` = `least` the
-    inverse is nearly infinite along such a direction; with `to` = 1 a solution hardly moves along it.
+    inverse is nearly infinite along such a direction; with `to` = 1 a solution hardly moves along it. `scale` (..., n)
+    replaces the roots of the diagonal.
     """
     if not np.isfinite(S).all():
         raise NumericalError(*NOT_FINITE)
-    diagonal = np.einsum("...ii->...i", S)
-    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    if scale is None:
+        diagonal = np.einsum("...ii->...i", S)
+        scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     pairs = scale[..., :, None] * scale[..., None, :]
     values, vectors = np.linalg.eigh(S / pairs)
     singular = np.any(values < least, axis=-1, keepdims=True)[..., None]
@@ -148,24 +152,11 @@ def _eliminate(S: FloatArray, B: FloatArray, least: float, to: float) -> FloatAr
     for start in range(0, n, 8):  # a few rows at once, without BLAS
         pivot = slice(start, min(start + 8, n))
         rest = np.r_[0:start, pivot.stop : n]
-        block = _lift_pivot(M[pivot, pivot], before[pivot], least, to)
+        block = lift_eigenvalues(M[pivot, pivot], least, to, before[pivot])
         row = np.einsum("ij,jk->ik", np.linalg.inv(block), M[pivot, pivot.stop :])
         M[pivot, pivot.stop :] = row
         M[rest, pivot.stop :] -= np.einsum("ij,jk->ik", M[rest, pivot], row)
     return np.asarray(M[:, n:], np.float64)
-
-
-def _lift_pivot(block: FloatArray, before: FloatArray, least: float, to: float) -> FloatArray:
-    """Lift eigenvalues of mere rounding; `before` (n,) is the root of the diagonal before elimination."""
-    if not np.isfinite(block).all():
-        raise NumericalError(*NOT_FINITE)
-    scale = before[:, None] * before
-    values, vectors = np.linalg.eigh(block / scale)
-    if values[0] >= least:
-        return block
-    return np.asarray(
-        np.einsum("ik,k,jk->ij", vectors, np.where(values < least, to, values), vectors) * scale, np.float64
-    )
 
 
 # Damping of Levenberg-Marquardt steps (Marquardt 1963). The kernels of `fundamental.refits` and

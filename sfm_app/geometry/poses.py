@@ -96,6 +96,34 @@ def retract(pose: FloatArray, step: FloatArray) -> FloatArray:
     return out
 
 
+@kernel
+def write_nearby_essentials(pose: FloatArray, step: float, Es: FloatArray) -> None:
+    """Write E of a pose, and with each of its five parameters a step away, into `Es` (6, 3, 3)."""
+    parameters = np.zeros(POSE_DOF)
+    write_essential(pose, Es[0])
+    for j in range(POSE_DOF):
+        parameters[j] = step
+        write_essential(retract(pose, parameters), Es[1 + j])
+        parameters[j] = 0.0
+
+
+@kernel
+def sampson_of_rays(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
+    """Return the signed Sampson distance of a match from its bearing vectors p and q, see `camera.bearings`."""
+    l0 = E[0, 0] * p[0] + E[0, 1] * p[1] + E[0, 2] * p[2]
+    l1 = E[1, 0] * p[0] + E[1, 1] * p[1] + E[1, 2] * p[2]
+    l2 = E[2, 0] * p[0] + E[2, 1] * p[1] + E[2, 2] * p[2]
+    k0 = E[0, 0] * q[0] + E[1, 0] * q[1] + E[2, 0] * q[2]
+    k1 = E[0, 1] * q[0] + E[1, 1] * q[1] + E[2, 1] * q[2]
+    k2 = E[0, 2] * q[0] + E[1, 2] * q[1] + E[2, 2] * q[2]
+    g0 = k0 * p[3] + k1 * p[4] + k2 * p[5]
+    g1 = k0 * p[6] + k1 * p[7] + k2 * p[8]
+    h0 = l0 * q[3] + l1 * q[4] + l2 * q[5]
+    h1 = l0 * q[6] + l1 * q[7] + l2 * q[8]
+    algebraic = q[0] * l0 + q[1] * l1 + q[2] * l2
+    return float(algebraic / np.sqrt(g0 * g0 + g1 * g1 + h0 * h0 + h1 * h1 + 1e-300))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity:
     """x -> scale R x + t."""

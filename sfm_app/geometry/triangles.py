@@ -15,8 +15,7 @@ def vertex_normals(vertices: FloatArray, faces: IndexArray) -> FloatArray:
     """Return (V, 3) unit normals: means over adjacent triangles weighted by area; 0 at unused vertices."""
     total = np.zeros((len(vertices), 3))
     _add_normals(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64), total)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0))
+    return normalize(total)
 
 
 @kernel

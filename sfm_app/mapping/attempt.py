@@ -8,7 +8,6 @@ from functools import partial
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.bearings import bearings
 from sfm_app.colmap.backend import CancellationToken, Reconstruction, run_interruptible, translate_errors
@@ -17,7 +16,7 @@ from sfm_app.colmap.model import model_from_seed, placed_views
 from sfm_app.errors import BackendError
 from sfm_app.geometry.epipolar import GOOD_ANGLE_DEG, TwoViewSeed, cross_matrix, ray_seed, two_view_seed
 from sfm_app.numerical import FAILURES, error_reason
-from sfm_app.posegraph.pair_pose import is_in_front, pose_distances, ray_angles_deg
+from sfm_app.posegraph.pair_pose import explained_mask, ray_angles_deg
 from sfm_app.retrieval import choose_by_rank
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Evidence, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
@@ -157,7 +156,7 @@ def explained_pairs(model: Reconstruction, evidence: Evidence, max_error_px: flo
     """Return how well a model explains every pair of its photos."""
     explained = {}
     for pair, posed in _posed_pairs(model, evidence.matches):
-        fits_model = posed.inlier_mask(MAPPING.loose_factor * max_error_px)
+        fits_model = explained_mask(*posed, MAPPING.loose_factor * max_error_px)
         fit = evidence.views.fits.get(pair)
         contradicted = int(np.count_nonzero(fit.inliers & ~fits_model)) if fit else 0
         explained[pair] = PairSupport(int(np.count_nonzero(fits_model)), fit.inlier_count if fit else 0, contradicted)
@@ -169,29 +168,21 @@ def model_poses(
 ) -> dict[PairId, RelativePose]:
     """Return the relative poses of a model for the pairs of its photos with at least `least` explained matches."""
     poses = {}
-    for pair, posed in _posed_pairs(model, matches):
-        inliers = posed.inlier_mask(max_error_px)
+    for pair, (lines, R, t) in _posed_pairs(model, matches):
+        inliers = explained_mask(lines, R, t, max_error_px)
         if np.count_nonzero(inliers) >= least:
-            angle_deg = float(np.median(ray_angles_deg(posed.lines[inliers], posed.R)))
-            poses[pair] = RelativePose(posed.R, posed.t, inliers, angle_deg=angle_deg, in_front=1.0, kind="calibrated")
+            angle_deg = float(np.median(ray_angles_deg(lines[inliers], R)))
+            poses[pair] = RelativePose(R, t, inliers, angle_deg=angle_deg, in_front=1.0, kind="calibrated")
     return poses
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _PosedPair:
-    lines: FloatArray
-    """(M, 18) matches as bearing vectors of view 1 and of view 2."""
-    R: FloatArray
-    t: FloatArray
-    """Rotation and translation, view 2 from view 1; t has length 1, or is 0 for equal positions."""
+def _posed_pairs(
+    model: Reconstruction, matches: MatchGraph
+) -> Iterator[tuple[PairId, tuple[FloatArray, FloatArray, FloatArray]]]:
+    """Yield the matches (M, 18) of pairs as bearing vectors, with R and t of view 2 from view 1.
 
-    def inlier_mask(self, max_error_px: float) -> NDArray[np.bool_]:
-        """Return (M,) which matches lie on their epipolar lines, in front of both cameras."""
-        distances = pose_distances(self.lines, self.R, self.t)
-        return np.asarray((distances <= max_error_px) & is_in_front(self.lines, self.R, self.t), bool)
-
-
-def _posed_pairs(model: Reconstruction, matches: MatchGraph) -> Iterator[tuple[PairId, _PosedPair]]:
+    t has length 1, or is 0 for equal positions.
+    """
     placed = placed_views(model, matches.keypoints)
     for pair, rows in matches.matches.items():
         if pair[0] not in placed or pair[1] not in placed:
@@ -200,7 +191,7 @@ def _posed_pairs(model: Reconstruction, matches: MatchGraph) -> Iterator[tuple[P
         R = second.R @ first.R.T
         t = second.t - R @ first.t
         lines = np.hstack([first.lines[rows[:, 0]], second.lines[rows[:, 1]]])
-        yield pair, _PosedPair(lines, R, t / max(float(np.linalg.norm(t)), 1e-300))
+        yield pair, (lines, R, t / max(float(np.linalg.norm(t)), 1e-300))
 
 
 def support(explained: Mapping[PairId, PairSupport]) -> float:
@@ -353,6 +344,12 @@ def complete_attempt(group: Group, attempt: Attempt, run: RunContext) -> Mapping
         return _GroupMapper(group, run, COLMAP).complete(attempt)
 
 
+def extend_model(group: Group, start: Reconstruction, run: RunContext) -> Reconstruction | None:
+    """Return a model with the missing photos of its group, as `complete_attempt` does, without a verdict."""
+    with translate_errors("mapping photos"):
+        return _GroupMapper(group, run, COLMAP).extend(start)
+
+
 class _GroupMapper:
     def __init__(self, group: Group, run: RunContext, colmap: ColmapMappers) -> None:
         self.group, self.run, self.colmap = group, run, colmap
@@ -379,11 +376,13 @@ class _GroupMapper:
         except FAILURES as err:
             return NoModel("incremental", f"{how}: no points, {error_reason(err)}")
         start = self.colmap.model_from_seed(self.run.workspace.database, seed.pair, rows, points)
-        return self._judge("incremental", how, self._map(partial(self._grow, start)))
+        return self._judge("incremental", how, self.extend(start))
 
     def complete(self, best: Attempt) -> MappingResult:
-        model = self._map(partial(self._grow, best.model))
-        return self._judge("incremental", "missing photos added one by one", model)
+        return self._judge("incremental", "missing photos added one by one", self.extend(best.model))
+
+    def extend(self, start: Reconstruction) -> Reconstruction | None:
+        return self._map(partial(self._grow, start))
 
     def _map(self, make: Callable[[CancellationToken], Reconstruction | None]) -> Reconstruction | None:
         self.run.progress.start("mapping", max(len(self.group.photos) - 2, 1))

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from sfm_app.colmap.joined_model import PlacedPhotos
 from sfm_app.geometry.poses import Similarity, robust_similarity
 from sfm_app.numerical import FAILURES
-from sfm_app.posegraph.pair_pose import is_in_front, pose_distances
-from sfm_app.posegraph.rotations import average_rotations, connected_groups
+from sfm_app.posegraph.pair_pose import explained_mask
+from sfm_app.posegraph.rotations import average_rotations, connected_groups, partners_of
 from sfm_app.types import MatchGraph, PairId, ViewGraph
 from sfm_app.types.arrays import FloatArray, IndexArray
 
@@ -87,10 +87,6 @@ class Join:
     """Photos that both hold."""
     points: int
     """Points of the agreeing photos that both hold."""
-    off_deg: float
-    """Median angle between the rotations of the agreeing photos."""
-    off: float
-    """Median distance of their centers, as a share of the distance of their points."""
     middle: FloatArray
     """(1, 3) middle of the agreeing photos in the frame of the second fragment."""
     explained: int = 0
@@ -121,13 +117,11 @@ def find_join(first: int, second: int, fragments: Sequence[Fragment]) -> Join | 
     agreeing_now = shared.agreement(refined)[0]
     if np.count_nonzero(agreeing_now) >= np.count_nonzero(agreeing):
         similarity, agreeing = refined, agreeing_now
-    _, angles, shifts = shared.agreement(similarity)
     observations = np.flatnonzero(agreeing[shared.photo])
     point_count = len(np.unique(shared.rows_a[observations]))
-    deviations = float(np.median(angles[agreeing])), float(np.median(shifts[agreeing]))
     middle = shared.cb[agreeing].mean(axis=0)[None]
     count = int(np.count_nonzero(agreeing))
-    return Join(first, second, similarity, count, len(photos), point_count, *deviations, middle)
+    return Join(first, second, similarity, count, len(photos), point_count, middle)
 
 
 class _SharedPhotos:
@@ -168,17 +162,17 @@ class _SharedPhotos:
         for number in np.flatnonzero(np.isfinite(self.scale)):
             R, scale = self.Ra[number].T @ self.Rb[number], float(self.scale[number])
             candidate = Similarity(scale, R, self.ca[number] - scale * R @ self.cb[number])
-            agreeing, _, shifts = self.agreement(candidate)
+            agreeing, shifts = self.agreement(candidate)
             rank = int(np.count_nonzero(agreeing)), -float(shifts[agreeing].sum())
             if rank > score:
                 best, score = (agreeing, candidate), rank
         return best
 
-    def agreement(self, similarity: Similarity) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
-        """Return (n,) which photos agree, their angles in degrees, and their shifts by the distance of their points."""
+    def agreement(self, similarity: Similarity) -> tuple[NDArray[np.bool_], FloatArray]:
+        """Return (n,) which photos agree, and their shifts by the distance of their points."""
         angles = _angles_deg(self.Ra, np.einsum("nij,kj->nik", self.Rb, similarity.R))
         shifts = np.linalg.norm(similarity(self.cb) - self.ca, axis=1) / self.distance
-        return (angles <= OPTIONS.agreement_deg) & (shifts <= OPTIONS.agreement_shift), angles, shifts
+        return (angles <= OPTIONS.agreement_deg) & (shifts <= OPTIONS.agreement_shift), shifts
 
     def refine(self, points: IndexArray, similarity: Similarity) -> Similarity:
         """Fit a similarity to shared points; return the given one where they do not determine any."""
@@ -208,10 +202,7 @@ class AcrossJoins:
 
     def __init__(self, matches: MatchGraph, views: ViewGraph, max_error_px: float) -> None:
         self.matches, self.views, self.max_error_px = matches, views, max_error_px
-        self.partners: dict[int, list[int]] = {}
-        for a, b in views.fits:
-            self.partners.setdefault(a, []).append(b)
-            self.partners.setdefault(b, []).append(a)
+        self.partners = partners_of(views.fits)
 
     def count(self, join: Join, fragments: Sequence[Fragment]) -> tuple[int, int]:
         """Return how many matches a join explains, and how many inliers it contradicts, without shared photos."""
@@ -227,8 +218,7 @@ class AcrossJoins:
             R_b = b.R[at_b] @ join.similarity.R.T
             t = R_b @ (a.centers[at_a] - join.similarity(b.centers[at_b][None])[0])
             R, t = R_b @ a.R[at_a].T, t / max(float(np.linalg.norm(t)), 1e-300)
-            within = pose_distances(lines, R, t) <= OPTIONS.loose_factor * self.max_error_px
-            explained_matches = within & is_in_front(lines, R, t)
+            explained_matches = explained_mask(lines, R, t, OPTIONS.loose_factor * self.max_error_px)
             explained += int(np.count_nonzero(explained_matches))
             contradicted += int(np.count_nonzero(self.views.fits[pair].inliers & ~explained_matches))
         return explained, contradicted
@@ -239,9 +229,8 @@ class AcrossJoins:
         alone = there - here
         ranked = [
             (-self.views.fits[min(i, j), max(i, j)].inlier_count, i, j)
-            for i in sorted(here - there)
-            for j in self.partners.get(i, ())
-            if j in alone
+            for i in here - there
+            for j in alone.intersection(self.partners.get(i, ()))
         ]
         return [(i, j) for _, i, j in sorted(ranked)[: OPTIONS.max_checked]]
 
@@ -251,65 +240,49 @@ class AcrossJoins:
 # one first, and the frames are estimated again: chains do not drift where a loop closes them.
 
 
-@dataclass(frozen=True, slots=True)
-class JoinError:
-    """Difference of a similarity from the one that others imply."""
-
-    off_deg: float
-    scale: float
-    """Logarithm of the ratio of scales."""
-    shift: float
-    """As a share of the radius of the smaller fragment."""
-
-    @property
-    def excess(self) -> float:
-        """The largest of the three errors, as a multiple of its limit."""
-        return max(self.off_deg / OPTIONS.max_deg, abs(self.scale) / OPTIONS.max_scale, self.shift / OPTIONS.max_shift)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
     """Fragments in common frames."""
 
     frames: Mapping[int, Similarity]
     """From the frame of each fragment to the common one, for the largest group of joined fragments."""
-    kept: tuple[tuple[Join, JoinError], ...]
-    dropped: tuple[tuple[Join, JoinError], ...]
-    """Joins that contradict the others, with their errors when they were dropped."""
+    kept: tuple[Join, ...]
+    dropped: tuple[Join, ...]
+    """Joins that contradict the others."""
 
 
 def align_fragments(fragments: Sequence[Fragment], joins: Sequence[Join]) -> Alignment:
     """Find a common frame for the fragments that joins connect, without joins that contradict the others."""
     radii = [fragment.radius for fragment in fragments]
-    remaining = list(joins)
-    dropped: list[tuple[Join, JoinError]] = []
+    remaining, dropped = list(joins), list[Join]()
     while True:
         frames = _synchronize(remaining, len(fragments))
         implied = [frames[join.first].inverse().compose(frames[join.second]) for join in remaining]
-        errors = [difference(join, one, radii) for join, one in zip(remaining, implied, strict=True)]
+        errors = [contradiction(join, one, radii) for join, one in zip(remaining, implied, strict=True)]
         # a single loop is equally far off in all of its joins: the one with least evidence goes
-        ranked = sorted(range(len(remaining)), key=lambda k: (-errors[k].excess / remaining[k].weight, k))
-        worst = next((k for k in ranked if errors[k].excess > 1.0), None)
+        ranked = sorted(range(len(remaining)), key=lambda k: (-errors[k] / remaining[k].weight, k))
+        worst = next((k for k in ranked if errors[k] > 1.0), None)
         if worst is None:
             break
-        dropped.append((remaining.pop(worst), errors[worst]))
+        dropped.append(remaining.pop(worst))
     groups = connected_groups([(join.first, join.second) for join in remaining], range(len(fragments)))
     photos = [set(fragment.placed.photos.tolist()) for fragment in fragments]
     main = max(
         groups, key=lambda group: (len(set[int]().union(*(photos[k] for k in group))), -min(group)), default=set()
     )
-    accepted = tuple(zip(remaining, errors, strict=True))
-    return Alignment({number: frames[number] for number in sorted(main)}, accepted, tuple(dropped))
+    return Alignment({number: frames[number] for number in sorted(main)}, tuple(remaining), tuple(dropped))
 
 
-def difference(join: Join, expected: Similarity, radii: Sequence[float]) -> JoinError:
-    """Return the difference of a join from another similarity; radii are in units of each fragment."""
+def contradiction(join: Join, expected: Similarity, radii: Sequence[float]) -> float:
+    """Return the largest error of a join, as a multiple of its limit, if another similarity is right.
+
+    Radii are in units of each fragment.
+    """
     smaller = min(radii[join.first], expected.scale * radii[join.second])
-    return JoinError(
-        float(_angles_deg(expected.R[None], join.similarity.R[None])[0]),
-        float(np.log(join.similarity.scale / expected.scale)),
-        float(np.linalg.norm(join.similarity(join.middle) - expected(join.middle))) / max(smaller, 1e-300),
-    )
+    off_deg = float(_angles_deg(expected.R[None], join.similarity.R[None])[0])
+    scale = abs(float(np.log(join.similarity.scale / expected.scale)))
+    shift = float(np.linalg.norm(join.similarity(join.middle) - expected(join.middle))) / max(smaller, 1e-300)
+    return max(off_deg / OPTIONS.max_deg, scale / OPTIONS.max_scale, shift / OPTIONS.max_shift)
 
 
 def _synchronize(joins: Sequence[Join], count: int) -> dict[int, Similarity]:

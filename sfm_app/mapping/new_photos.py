@@ -8,22 +8,20 @@ import logging
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
-from sfm_app.colmap.backend import CancellationToken, Reconstruction, run_interruptible, translate_errors
+from sfm_app.colmap.backend import Reconstruction, translate_errors
 from sfm_app.colmap.database import write_calibrations, write_match_graph
 from sfm_app.colmap.growth import model_in_database
-from sfm_app.colmap.mapping import incremental_options, map_incrementally
 from sfm_app.colmap.model import posed_photo_ids, submodel
 from sfm_app.errors import BackendError
 from sfm_app.estimation.calibrating import find_intrinsics
 from sfm_app.mapping.attempt import (
-    INCREMENTAL_FOLDER,
     MAPPING,
     Attempt,
     Group,
     best_attempt,
     doubt,
     explained_pairs,
-    is_focal_accurate,
+    extend_model,
     judge_model,
     map_group,
     model_poses,
@@ -142,28 +140,13 @@ def _doubt(
 
 def _place(start: Reconstruction, group: Group, run: RunContext) -> Reconstruction | None:
     placed = posed_photo_ids(start)
-    unplaced = len(set(group.photos).difference(placed))
-    if not unplaced:
+    if not set(group.photos).difference(placed):
         return submodel(start, placed)
-    run.progress.start("mapping", unplaced)
     try:
-        with translate_errors("mapping photos"):
-            return run_interruptible(lambda token: _extend(start, group, run, token))
+        return extend_model(group, start, run)
     except BackendError as err:  # all photos are mapped again
         logger.info("the earlier model could not be extended: %s", err)
         return None
-    finally:
-        run.progress.finish()
-
-
-def _extend(start: Reconstruction, group: Group, run: RunContext, token: CancellationToken) -> Reconstruction | None:
-    cameras = {photo: group.evidence.camera(photo) for photo in group.photos}
-    kept = {start.images[photo].camera_id for photo, camera in cameras.items() if camera.is_kept}
-    place, is_known = run.workspace, all(is_focal_accurate(camera) for camera in cameras.values())
-    return map_incrementally(
-        place.database, place.photos, start, place.root / INCREMENTAL_FOLDER,
-        incremental_options(run.seed, known=is_known, kept=kept), run.progress.advance, token,
-    )  # fmt: skip
 
 
 def _map_others(graph: PoseGraph, taken: Collection[int], evidence: Evidence, run: RunContext) -> list[Attempt]:

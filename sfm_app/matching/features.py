@@ -34,7 +34,6 @@ from sfm_app.colmap.features import (
 from sfm_app.colmap.worker_process import ProcessGroup, ProgressReporter, SiftOption, run_worker
 from sfm_app.errors import InputError, PluginError
 from sfm_app.files import load_arrays, mark_unfinished, replace_atomically, resume_or_clear
-from sfm_app.numerical import Json
 from sfm_app.photos.masks import read_mask
 from sfm_app.photos.panoramas import PanoramaViews, shrink
 from sfm_app.plugins import FeatureMethod
@@ -226,19 +225,16 @@ CHUNKS = ChunkOptions()
 Item = TypeVar("Item")
 
 
-def find_in_chunks(sift: Mapping[str, SiftOption], names: Sequence[str], run: RunContext) -> dict[str, Json]:
-    """Find features of photos that have none on a cluster; return the options in force."""
+def find_in_chunks(sift: Mapping[str, SiftOption], names: Sequence[str], run: RunContext) -> None:
+    """Find features of photos that have none on a cluster."""
     chosen = set(names)
     missing = [name for name in photos_without_features(run.workspace.database).values() if name in chosen]
     parts = chunks(missing, CHUNKS.most_photos, run.spread)
-    return _do_in_chunks(partial(Task, find_in_chunk), parts, FEATURES, sift, run)
+    _do_in_chunks(partial(Task, find_in_chunk), parts, FEATURES, sift, run)
 
 
-def match_in_chunks(sift: Mapping[str, SiftOption], pairs: Sequence[PairId] | None, run: RunContext) -> dict[str, Json]:
-    """Match pairs, all if None, on a cluster or in processes of this machine, except those in the database.
-
-    Returns the options in force.
-    """
+def match_in_chunks(sift: Mapping[str, SiftOption], pairs: Sequence[PairId] | None, run: RunContext) -> None:
+    """Match pairs, all if None, on a cluster or in processes of this machine, except those in the database."""
     database = run.workspace.database
     wanted = exhaustive_pairs(sorted(photo_names(database))) if pairs is None else pairs
     missing = unmatched_pairs(database, wanted)
@@ -247,12 +243,11 @@ def match_in_chunks(sift: Mapping[str, SiftOption], pairs: Sequence[PairId] | No
     most = min(max(int(CHUNKS.chunk_s / pair_s), CHUNKS.least_pairs), CHUNKS.most_pairs)
     parts = cut_pairs(missing, chunk_size(len(missing), most, run.spread or run.workers))
     if run.spread:
-        return _do_in_chunks(partial(Task, match_chunk), parts, MATCHES, sift, run)
+        _do_in_chunks(partial(Task, match_chunk), parts, MATCHES, sift, run)
+        return
     group, counter = ProcessGroup(), _PairCounter(run.progress)
     try:
-        return _do_in_chunks(
-            lambda inputs: partial(match_chunk_apart, inputs, group, counter), parts, MATCHES, sift, run
-        )
+        _do_in_chunks(lambda inputs: partial(match_chunk_apart, inputs, group, counter), parts, MATCHES, sift, run)
     finally:
         group.stop()
 
@@ -284,12 +279,12 @@ def _do_in_chunks(
     tables: tuple[str, str],
     sift: Mapping[str, SiftOption],
     run: RunContext,
-) -> dict[str, Json]:
+) -> None:
     place, label = run.workspace, "matching" if tables is MATCHES else "features"
-    folder, in_force = place.sift_rows, dict[str, Json]()
+    folder = place.sift_rows
     shutil.rmtree(folder, ignore_errors=True)
     if not parts:
-        return in_force
+        return
     masks = run.mask_dir.absolute() if run.mask_dir else None
     settings = SiftSettings(place.photos.absolute(), masks, run.settings.matching, dict(sift))
     inputs = SiftInputs(settings, folder.absolute())
@@ -298,55 +293,51 @@ def _do_in_chunks(
     try:
         for part in ordered_map(run.executor, prepare(inputs), parts, ahead=run.workers):
             enter_rows(place.database, part.path, tables)
-            in_force |= part.in_force
             run.progress.advance(part.count)
     finally:
         run.progress.finish()
         shutil.rmtree(folder, ignore_errors=True)
-    return in_force
 
 
 # All features and matches, by COLMAP's SIFT or by a plug-in of two functions.
 
 
-def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
-    """Find features of photos and match them, in the run's database; return the options in force, for the manifest.
+def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> None:
+    """Find features of photos and match them, in the run's database.
 
     Features are computed in the photos of `pairs` only, with the smaller id first; for None, all photos and all pairs.
     Without any pair, all photos get features. PluginError if the method raises, or returns invalid results.
     """
-    in_force = find_all_features(method, run, pairs)
-    in_force |= match_pairs(method, run, pairs)
+    find_all_features(method, run, pairs)
+    match_pairs(method, run, pairs)
     forget_features(run)
-    return in_force
 
 
-def find_all_features(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
+def find_all_features(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> None:
     """Find features of photos, except those of a killed run; arguments and errors as in `fill_database`."""
-    place, options = run.workspace, run.settings.matching
-    names = photo_names(place.database)
+    place, names = run.workspace, photo_names(run.workspace.database)
     if pairs:
         names = {photo: names[photo] for photo in sorted({photo for pair in pairs for photo in pair})}
-    if method.sift is not None and run.spread:
-        return find_in_chunks(method.sift, list(names.values()), run)
-    if method.sift is not None:
-        settings = SiftSettings(place.photos, run.mask_dir, options, method.sift)
+    if method.sift is None:
+        if not resume_or_clear(place.feature_parts, run.fingerprint):
+            mark_unfinished(place.feature_parts, run.fingerprint)
+        find_features(method, names, run)
+    elif run.spread:
+        find_in_chunks(method.sift, list(names.values()), run)
+    else:
+        settings = SiftSettings(place.photos, run.mask_dir, run.settings.matching, method.sift)
         find = partial(find_sift, place.database, settings, list(names.values()), run.workers, ProgressReporter())
-        return run_worker(find, "finding features", run.progress)
-    if not resume_or_clear(place.feature_parts, run.fingerprint):
-        mark_unfinished(place.feature_parts, run.fingerprint)
-    find_features(method, names, run)
-    return {"method": method.name, "max_image_size": options.max_image_size_px, "max_features": options.max_features}
+        run_worker(find, "finding features", run.progress)
 
 
-def match_pairs(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
+def match_pairs(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> None:
     """Match pairs of photos with known features, except those of a killed run; see `fill_database`."""
     if pairs is not None and not pairs:
-        return {}
+        return
     if method.sift is not None:
-        return match_in_chunks(method.sift, pairs, run)
-    _match(method, all_pairs(photo_names(run.workspace.database)) if pairs is None else pairs, run)
-    return {}
+        match_in_chunks(method.sift, pairs, run)
+    else:
+        _match(method, all_pairs(photo_names(run.workspace.database)) if pairs is None else pairs, run)
 
 
 def forget_features(run: RunContext) -> None:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import largest_descriptors, photo_names, read_features
 from sfm_app.matching.features import match_pairs, read_pixels
-from sfm_app.numerical import Json
 from sfm_app.plugins import FeatureMethod
 from sfm_app.retrieval import (
     DescriptorArray,
@@ -158,29 +157,28 @@ def _preview(descriptors: Mapping[int, DescriptorArray], candidates: tuple[int, 
     return dict(zip(((photo, other) for other in others), scaled, strict=True))
 
 
-def match_probable_pairs(method: FeatureMethod, load: Callable[[], MatchGraph], run: RunContext) -> dict[str, Json]:
+def match_probable_pairs(method: FeatureMethod, load: Callable[[], MatchGraph], run: RunContext) -> None:
     """Match pairs of photos that look alike or lie beside each other, then pairs that these suggest.
 
-    Pairs of photos of an earlier run keep their matches. `load` reads the match graph as it is now. Returns the options
-    in force; errors as of `fill_database`.
+    Pairs of photos of an earlier run keep their matches. `load` reads the match graph as it is now. Errors as of
+    `fill_database`.
     """
     initial = load()
     known = run.earlier.known if run.earlier is not None else frozenset[str]()
     new = {photo for photo, image in initial.images.items() if image.name not in known}
     if not new:  # photos were only removed
         run.record(matched_pairs=0, rounds=[0, 0])
-        return {}
+        return
     first = first_pairs(initial.images, lambda photo: _descriptors(method, initial.images[photo], run), run, new)
     first = pairs_with_new_photos(first, initial.images, known)
-    in_force = match_pairs(method, run, first)
+    match_pairs(method, run, first)
     graph, matched = load(), set(first)
     matched |= graph.matches.keys() - set(pairs_with_new_photos(graph.matches, initial.images, known))
     matches = {pair: rows for pair, rows in graph.matches.items() if pair in matched}
     counts = {photo: len(points) for photo, points in graph.keypoints.items()}
     second = second_pairs(counts, matches, matched, run.settings.matching, new)
-    in_force |= match_pairs(method, run, second)
+    match_pairs(method, run, second)
     run.record(matched_pairs=len(first) + len(second), rounds=[len(first), len(second)])
-    return in_force
 
 
 def _descriptors(method: FeatureMethod, image: MatchedImage, run: RunContext) -> NDArray[np.uint8]:

@@ -75,14 +75,10 @@ def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> Relat
     return pose if pose.in_front >= GUIDED.min_in_front and pose.kind != "rotation" else None
 
 
-def _epipolar_normals(pair: Pair, R: FloatArray) -> FloatArray:
-    """Return (N, 3), for each match the vector that the translation is perpendicular to, given R."""
-    return np.asarray(np.cross(pair.lines[:, FIRST] @ R.T, pair.lines[:, SECOND]), np.float64)
-
-
 def sample_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> FloatArray | None:
     """Estimate the direction of translation (3,) by samples of two matches, given R; None if no sample gives one."""
-    normals = _epipolar_normals(pair, R)
+    # the translation is perpendicular to each of them
+    normals = np.cross(pair.lines[:, FIRST] @ R.T, pair.lines[:, SECOND])
     picks = rng.integers(len(normals), size=(GUIDED.samples, 2))
     directions = np.cross(normals[picks[:, 0]], normals[picks[:, 1]])
     lengths = np.linalg.norm(directions, axis=1)

@@ -15,7 +15,7 @@ tracks and paths of photos are connected. Both are needed: a wide baseline misse
 tracks.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from sfm_app.camera.bearings import bearings, depths_along, project
 from sfm_app.geometry.epipolar import FIRST, SECOND, depths
-from sfm_app.posegraph.rotations import DisjointGroups, average_rotations
+from sfm_app.posegraph.rotations import DisjointGroups, average_rotations, partners_of
 from sfm_app.types import Calibration, LookAlikes, MatchGraph, PairId, RelativePose
 from sfm_app.types.arrays import FloatArray, IndexArray
 
@@ -133,10 +133,7 @@ def backbone(covered: Mapping[PairId, float]) -> set[PairId]:
     Groups of photos grow along the best pairs. When two of them join, the pair that joins them is the weakest one on
     the path between any photo of the one and any of the other.
     """
-    partners: dict[int, list[int]] = {photo: [] for pair in covered for photo in pair}
-    for a, b in covered:
-        partners[a].append(b)
-        partners[b].append(a)
+    partners = partners_of(covered)
     groups, chosen = DisjointGroups(partners), set()
     for a, b in sorted(covered, key=lambda pair: (-covered[pair], pair)):
         joining = groups.join(a, b)
@@ -344,13 +341,13 @@ def find_look_alikes(
     along = {pair: poses[pair] for pair in sorted(trusted)}
     weights = {pair: float(pose.inlier_count) for pair, pose in along.items()}
     rotations, _ = average_rotations({pair: pose.R for pair, pose in along.items()}, weights)
-    partners = _partners(trusted)
+    partners = partners_of(trusted)
     judged = [_judge_join(join, partners, rotations, places) for join in group_doubted_pairs(doubted, trusted)]
     joins = [join for join, verdict in judged if verdict == ALIKE]
     doubtful = tuple(join for join, verdict in judged if verdict == EITHER)
     others = poses.keys() - best - {pair for join in joins for pair in join.pairs}
-    weak = sorted(pair for pair in others if tracks.is_contradicted_by(pair, rows_of[pair], OPTIONS.min_tracked_nearby))
-    complete = tuple(_add_weak_pairs(join, weak, trusted) for join in joins)
+    weak = {pair for pair in others if tracks.is_contradicted_by(pair, rows_of[pair], OPTIONS.min_tracked_nearby)}
+    complete = tuple(_add_weak_pairs(join, weak, partners) for join in joins)
     return LookAlikeVerdict(complete, doubtful, tracks)
 
 
@@ -375,53 +372,42 @@ def _build_tracks(visibility: Visibility, pairs: Iterable[PairId]) -> FeatureTra
 
 def group_doubted_pairs(doubted: Iterable[PairId], trusted: Iterable[PairId]) -> list[tuple[PairId, ...]]:
     """Group doubted pairs that join the same two places: their photos are the same or joined by a trusted pair."""
-    neighbors = _partners(trusted)
+    neighbors = partners_of(trusted)
     waiting, groups = dict.fromkeys(sorted(doubted)), []
     while waiting:
         join = [next(iter(waiting))]
         del waiting[join[0]]
-        for a, b in join:
-            ends = ((c, d) for c in sorted({a, *neighbors.get(a, ())}) for d in sorted({b, *neighbors.get(b, ())}))
-            adjacent = [pair for c, d in ends if (pair := (min(c, d), max(c, d))) in waiting]
+        for known in join:
+            adjacent = _pairs_beside(known, neighbors, waiting)
             for pair in adjacent:
-                waiting.pop(pair, None)
-            join += dict.fromkeys(adjacent)
+                del waiting[pair]
+            join += adjacent
         groups.append(tuple(sorted(join)))
     return groups
 
 
-def _add_weak_pairs(join: LookAlikes, weak: list[PairId], trusted: Iterable[PairId]) -> LookAlikes:
-    """Move the weak pairs between the two places of a join from the list into the join."""
-    close = {frozenset(pair) for pair in trusted}
-    also = [pair for pair in weak if any(_has_same_ends(pair, other, close) for other in join.pairs)]
-    weak[:] = [pair for pair in weak if pair not in also]
+def _pairs_beside(known: PairId, neighbors: Mapping[int, set[int]], among: Collection[PairId]) -> list[PairId]:
+    """Return those `among` pairs that join the same two places as a known one."""
+    first, second = ({photo, *neighbors.get(photo, ())} for photo in known)
+    ends = ((min(a, b), max(a, b)) for a in sorted(first) for b in sorted(second))
+    return list(dict.fromkeys(pair for pair in ends if pair in among))
+
+
+def _add_weak_pairs(join: LookAlikes, weak: set[PairId], partners: Mapping[int, set[int]]) -> LookAlikes:
+    """Move the weak pairs between the two places of a join from the set into the join."""
+    also = {pair for known in join.pairs for pair in _pairs_beside(known, partners, weak)}
+    weak -= also
     return replace(join, pairs=tuple(sorted((*join.pairs, *also))))
-
-
-def _has_same_ends(pair: PairId, other: PairId, close: set[frozenset[int]]) -> bool:
-    def is_same_place(a: int, b: int) -> bool:
-        return a == b or frozenset((a, b)) in close
-
-    (a, b), (c, d) = pair, other
-    return (is_same_place(a, c) and is_same_place(b, d)) or (is_same_place(a, d) and is_same_place(b, c))
 
 
 def _is_confirmed(same: int, tracked: int) -> bool:
     return tracked > 0 and same >= OPTIONS.confirmed_share * tracked
 
 
-def _partners(pairs: Iterable[PairId]) -> dict[int, set[int]]:
-    partners: dict[int, set[int]] = {}
-    for a, b in pairs:
-        partners.setdefault(a, set()).add(b)
-        partners.setdefault(b, set()).add(a)
-    return partners
-
-
 def _judge_join(
     join: tuple[PairId, ...], partners: Mapping[int, set[int]], rotations: Mapping[int, FloatArray], places: Depths
 ) -> tuple[LookAlikes, str]:
-    claimed = _partners(join)
+    claimed = partners_of(join)
     counts = [
         count_missing_cells(photo, claimed[photo], partners[photo], places)
         for photo in sorted(claimed)

@@ -23,7 +23,7 @@ from sfm_app.geometry.epipolar import (
     rotation_residuals,
 )
 from sfm_app.geometry.least_squares import DECREASE, INCREASE, DampingRange
-from sfm_app.geometry.poses import POSE_DOF, retract, write_essential
+from sfm_app.geometry.poses import POSE_DOF, retract, sampson_of_rays, write_essential, write_nearby_essentials
 from sfm_app.jit import kernel
 from sfm_app.types import Calibration, EpipolarFit, EpipolarGeometry, RelativePose
 from sfm_app.types.arrays import FloatArray
@@ -134,28 +134,11 @@ def pose_distances(lines: FloatArray, R: FloatArray, t: FloatArray) -> FloatArra
 
 
 @kernel
-def _distance(line: FloatArray, E: FloatArray) -> float:
-    """Return the signed distance of one match, (18,)."""
-    l0 = E[0, 0] * line[0] + E[0, 1] * line[1] + E[0, 2] * line[2]
-    l1 = E[1, 0] * line[0] + E[1, 1] * line[1] + E[1, 2] * line[2]
-    l2 = E[2, 0] * line[0] + E[2, 1] * line[1] + E[2, 2] * line[2]
-    k0 = E[0, 0] * line[9] + E[1, 0] * line[10] + E[2, 0] * line[11]
-    k1 = E[0, 1] * line[9] + E[1, 1] * line[10] + E[2, 1] * line[11]
-    k2 = E[0, 2] * line[9] + E[1, 2] * line[10] + E[2, 2] * line[11]
-    g0 = k0 * line[3] + k1 * line[4] + k2 * line[5]
-    g1 = k0 * line[6] + k1 * line[7] + k2 * line[8]
-    h0 = l0 * line[12] + l1 * line[13] + l2 * line[14]
-    h1 = l0 * line[15] + l1 * line[16] + l2 * line[17]
-    algebraic = line[9] * l0 + line[10] * l1 + line[11] * l2
-    return float(algebraic / np.sqrt(g0 * g0 + g1 * g1 + h0 * h0 + h1 * h1 + 1e-300))
-
-
-@kernel
 def _distances(lines: FloatArray, pose: FloatArray) -> FloatArray:
     E, distances = np.empty((3, 3)), np.empty(lines.shape[0])
     write_essential(pose, E)
     for i in range(lines.shape[0]):
-        distances[i] = _distance(lines[i], E)
+        distances[i] = sampson_of_rays(lines[i, :9], lines[i, 9:], E)
     return distances
 
 
@@ -164,25 +147,21 @@ def _cost(lines: FloatArray, pose: FloatArray, sigma: float) -> float:
     E, cost = np.empty((3, 3)), 0.0
     write_essential(pose, E)
     for i in range(lines.shape[0]):
-        cost += np.log1p((_distance(lines[i], E) / sigma) ** 2)
+        cost += np.log1p((sampson_of_rays(lines[i, :9], lines[i, 9:], E) / sigma) ** 2)
     return cost
 
 
 @kernel
 def _system(lines: FloatArray, pose: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
     """Return the approximate Hessian (5, 5) and the negative gradient (5,) of half the cost."""
-    Es, J, step = np.empty((1 + POSE_DOF, 3, 3)), np.empty(POSE_DOF), np.zeros(POSE_DOF)
+    Es, J = np.empty((1 + POSE_DOF, 3, 3)), np.empty(POSE_DOF)
     A, b = np.zeros((POSE_DOF, POSE_DOF)), np.zeros(POSE_DOF)
-    write_essential(pose, Es[0])
-    for j in range(POSE_DOF):
-        step[j] = _DIFFERENCE_STEP
-        write_essential(retract(pose, step), Es[1 + j])
-        step[j] = 0.0
+    write_nearby_essentials(pose, _DIFFERENCE_STEP, Es)
     for i in range(lines.shape[0]):
-        r = _distance(lines[i], Es[0]) / sigma
+        r = sampson_of_rays(lines[i, :9], lines[i, 9:], Es[0]) / sigma
         weight = 1.0 / (1.0 + r * r)
         for j in range(POSE_DOF):
-            J[j] = (_distance(lines[i], Es[1 + j]) / sigma - r) / _DIFFERENCE_STEP
+            J[j] = (sampson_of_rays(lines[i, :9], lines[i, 9:], Es[1 + j]) / sigma - r) / _DIFFERENCE_STEP
         for j in range(POSE_DOF):
             b[j] -= weight * r * J[j]
             for k in range(POSE_DOF):
@@ -360,6 +339,11 @@ def is_in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> NDArray[np.bo
     """Return a mask (N,) of the matches `used` (N, 18) whose points lie in front of both cameras."""
     first, second = depths(used, R, t)
     return (first > 0) & (second > 0)
+
+
+def explained_mask(lines: FloatArray, R: FloatArray, t: FloatArray, max_error_px: float) -> NDArray[np.bool_]:
+    """Return a mask (N,) of the matches (N, 18) that lie on their epipolar lines, in front of both cameras."""
+    return (pose_distances(lines, R, t) <= max_error_px) & is_in_front(lines, R, t)
 
 
 def ray_angles_deg(used: FloatArray, R: FloatArray) -> FloatArray:

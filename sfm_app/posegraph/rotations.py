@@ -50,6 +50,15 @@ def connected_groups(pairs: Iterable[PairId], photos: Iterable[int] = ()) -> lis
     return sorted(map(set, groups.members.values()), key=lambda group: (-len(group), min(group)))
 
 
+def partners_of(pairs: Iterable[PairId]) -> dict[int, set[int]]:
+    """Return the photos that pairs connect with each photo."""
+    partners: dict[int, set[int]] = {}
+    for a, b in pairs:
+        partners.setdefault(a, set()).add(b)
+        partners.setdefault(b, set()).add(a)
+    return partners
+
+
 # Corrections of a fold. Averaging begins along a tree, and a tree through a look-alike misplaces a whole street. The
 # pairs of its true place then contradict the rotations, all by the same turn. The street is turned if these pairs
 # weigh more than the least cut between the two ends (Ford and Fulkerson 1956).

@@ -187,16 +187,6 @@ class Probe:
 
 
 @dataclass(frozen=True, slots=True)
-class Call:
-    """A task and some of its items."""
-
-    probe: Probe
-    function: bytes
-    items: bytes
-    """Both serialized."""
-
-
-@dataclass(frozen=True, slots=True)
 class Reply:
     """Results of a call, and its cost."""
 
@@ -213,9 +203,9 @@ class Reply:
     """Of the worker and its finished child processes."""
 
 
-def answer(call: Call) -> Reply:
-    """Apply a task to its items; errors of the task are part of the reply."""
-    if reason := find_misfit(call.probe):
+def answer(probe: Probe, function: bytes, items: bytes) -> Reply:
+    """Apply a task to its items, both serialized; errors of the task are part of the reply."""
+    if reason := find_misfit(probe):
         from distributed import get_worker
 
         return Reply(unfit=reason, worker=str(get_worker().address))
@@ -228,13 +218,13 @@ def answer(call: Call) -> Reply:
     error: Exception | None = None
     is_machine_error = False
     try:
-        function = deserialize(call.function)
-        for item in deserialize(call.items):
-            results.append(function(item))  # noqa: PERF401 - results before an error count
+        apply = deserialize(function)
+        for item in deserialize(items):
+            results.append(apply(item))  # noqa: PERF401 - results before an error count
     except Exception as err:  # the coordinator raises it
         error = picklable(err)
         is_machine_error = isinstance(err, MACHINE_ERRORS)
-    serialized = Serializer(Path(call.probe.folder)).serialize(results)
+    serialized = Serializer(Path(probe.folder)).serialize(results)
     took, used = time.perf_counter() - start, cpu_seconds() - spent
     return Reply(serialized, error, is_machine_error=is_machine_error, seconds=took, cpu_seconds=used)
 
@@ -353,10 +343,11 @@ class Cluster:
             raise ClusterError(f"no worker of {self.address} answers", hint=RESUME_HINT)
         return answers
 
-    def submit(self, call: Call, key: str) -> Any:
-        """Send a call to some worker, and return Dask's future of its reply; the key is unique."""
+    def submit(self, function: bytes, items: bytes, key: str) -> Any:
+        """Send a serialized task and items to some worker, and return Dask's future of its reply; the key is unique."""
+        probe = self.probe()
         try:
-            return self.client.submit(answer, call, key=key, pure=False)
+            return self.client.submit(answer, probe, function, items, key=key, pure=False)
         except Exception as err:  # the client is closed, or its connection broke
             raise self.make_loss_error() from err
 
@@ -521,7 +512,6 @@ class ClusterExecutor(ThreadPoolExecutor):
 class _Spreading:
     def __init__(self, executor: ClusterExecutor, task: Task[Any], serializer: Serializer) -> None:
         self.executor, self.cluster, self.task, self.serializer = executor, executor.cluster, task, serializer
-        self.probe = self.cluster.probe()
         self.function = serializer.serialize(task)
         self.name = getattr(task.func, "__name__", "task").lstrip("_")
         self._keys = (f"sfm-{self.name}-{secrets.token_hex(6)}-{number}" for number in count())
@@ -546,8 +536,8 @@ class _Spreading:
                 self.cluster.client.cancel([flight.future for flight in flights], force=True)
 
     def _send(self, items: list[Any]) -> _Flight:
-        call = Call(self.probe, self.function, self.serializer.serialize(items))
-        return _Flight(items, self.cluster.submit(call, next(self._keys)))
+        future = self.cluster.submit(self.function, self.serializer.serialize(items), next(self._keys))
+        return _Flight(items, future)
 
     def _land(self, flight: _Flight, *, again: bool = False) -> Iterator[Any]:
         """Yield the results of a call; if it lost its workers, its items are sent once more (`again`), each alone."""

@@ -104,9 +104,13 @@ class RunContext:
 
     @contextmanager
     def with_workers(self, workers: int) -> Iterator["RunContext"]:
-        """Provide the same run with another number of workers, which stop when the block ends."""
+        """Provide the same run with other workers, which end with the block; an error in it cancels their tasks."""
         with make_executor(workers, like=self.executor) as executor:
-            yield replace(self, workers=workers, executor=executor)
+            try:
+                yield replace(self, workers=workers, executor=executor)
+            except BaseException:
+                executor.shutdown(wait=False, cancel_futures=True)
+                raise
 
     @property
     def mask_dir(self) -> Path | None:

@@ -318,7 +318,7 @@ class SubWorkspace(Workspace):
 
     def __init__(self, of: Workspace, name: str) -> None:
         super().__init__(of.root / name)
-        self.of, self.photos, self.masks = of, of.photos, of.masks
+        self.photos, self.masks = of.photos, of.masks
 
 
 def _cannot_write(folder: Path, err: OSError) -> InputError:

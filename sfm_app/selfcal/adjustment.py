@@ -23,7 +23,7 @@ import numpy as np
 from sfm_app.camera.projection import BEARING, RADIUS
 from sfm_app.fundamental.solvers import mirror
 from sfm_app.geometry.least_squares import DampingRange, damped_step, solve_each
-from sfm_app.geometry.poses import POSE_DOF, retract, write_essential
+from sfm_app.geometry.poses import POSE_DOF, retract, sampson_of_rays, write_essential, write_nearby_essentials
 from sfm_app.jit import kernel
 from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.selfcal.pairs import write_camera, write_ray
@@ -71,19 +71,6 @@ DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e8)
 
 
 @kernel
-def _distance(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
-    """Return the distance r of the rays p of view 1 and q of view 2, each (10,) as `pairs.write_ray` writes it."""
-    l0 = E[0, 0] * p[0] + E[0, 1] * p[1] + E[0, 2]
-    l1 = E[1, 0] * p[0] + E[1, 1] * p[1] + E[1, 2]
-    l2 = E[2, 0] * p[0] + E[2, 1] * p[1] + E[2, 2]
-    k0 = E[0, 0] * q[0] + E[1, 0] * q[1] + E[2, 0]
-    k1 = E[0, 1] * q[0] + E[1, 1] * q[1] + E[2, 1]
-    g0, g1 = p[3] * k0 + p[4] * k1, p[6] * k0 + p[7] * k1
-    h0, h1 = q[3] * l0 + q[4] * l1, q[6] * l0 + q[7] * l1
-    return float((q[0] * l0 + q[1] * l1 + l2) / np.sqrt(g0 * g0 + g1 * g1 + h0 * h0 + h1 * h1 + 1e-300))
-
-
-@kernel
 def distances(
     matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray
 ) -> FloatArray:
@@ -98,7 +85,7 @@ def distances(
         for i in range(ends[k], ends[k + 1]):
             write_ray(matches[i, 0], matches[i, 1], first, -1.0, p)
             write_ray(matches[i, 2], matches[i, 3], second, -1.0, q)
-            signed[i] = _distance(p, q, E)
+            signed[i] = sampson_of_rays(p, q, E)
     return signed
 
 
@@ -131,7 +118,7 @@ def pair_systems(
     for k in range(len(poses)):
         shared = cameras[k, 0] == cameras[k, 1]
         J[:] = 0.0
-        _write_poses(poses[k], Es)
+        write_nearby_essentials(poses[k], _STEP, Es)
         for view in range(2):
             _write_cameras(thetas[cameras[k, view]], lenses[view])
         for i in range(ends[k], ends[k + 1]):
@@ -142,17 +129,6 @@ def pair_systems(
                 _add_match(A[k], b[k], J, r, (1.0 + r * r / ROBUST_SCALE**2) ** -2)
         mirror(A[k])
     return A, b
-
-
-@kernel
-def _write_poses(pose: FloatArray, Es: FloatArray) -> None:
-    """Write E of a pose, and with each of its five parameters a step away, into `Es` (6, 3, 3)."""
-    step = np.zeros(POSE_DOF)
-    write_essential(pose, Es[0])
-    for j in range(POSE_DOF):
-        step[j] = _STEP
-        write_essential(retract(pose, step), Es[1 + j])
-        step[j] = 0.0
 
 
 @kernel
@@ -179,15 +155,15 @@ def _write_rays(x: float, y: float, lenses: FloatArray, rays: FloatArray) -> Non
 @kernel
 def _write_derivatives(rays: FloatArray, Es: FloatArray, sigma: float, shared: bool, J: FloatArray) -> float:
     """Return the distance r of one match in sigma, and write its derivatives to `J` (15,); `shared` is one camera."""
-    r = _distance(rays[0, 0], rays[1, 0], Es[0]) / sigma
+    r = sampson_of_rays(rays[0, 0], rays[1, 0], Es[0]) / sigma
     for j in range(CAMERA):
         if shared:
-            J[j] = (_distance(rays[0, 1 + j], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
+            J[j] = (sampson_of_rays(rays[0, 1 + j], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
         else:
-            J[j] = (_distance(rays[0, 1 + j], rays[1, 0], Es[0]) / sigma - r) / _STEP
-            J[CAMERA + j] = (_distance(rays[0, 0], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
+            J[j] = (sampson_of_rays(rays[0, 1 + j], rays[1, 0], Es[0]) / sigma - r) / _STEP
+            J[CAMERA + j] = (sampson_of_rays(rays[0, 0], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
     for j in range(POSE_DOF):
-        J[2 * CAMERA + j] = (_distance(rays[0, 0], rays[1, 0], Es[1 + j]) / sigma - r) / _STEP
+        J[2 * CAMERA + j] = (sampson_of_rays(rays[0, 0], rays[1, 0], Es[1 + j]) / sigma - r) / _STEP
     return float(r)
 
 
@@ -362,7 +338,7 @@ def _normal_equations(matches: Matches, state: State) -> tuple[FloatArray, Float
 
 def _reduce_to_cameras(system: tuple[FloatArray, FloatArray]) -> Information:
     """Return the information of the pairs about their cameras, and the gains g = b' H^-1 b / 2 (see `_weigh_pairs`)."""
-    H, b, _, _ = _eliminate_poses(*system, 0.0)
+    H, b, _, _ = eliminate_poses(*system, 0.0)
     own = np.diag(np.tile(np.array(ADJUSTMENT.own_camera_sigmas) ** -2.0, 2))
     gains = 0.5 * np.einsum("pi,pi->p", b, solve_each(H + own, b[..., None])[..., 0])
     return Information(H, b, gains)
@@ -383,16 +359,16 @@ def _weigh_pairs(state: State, system: tuple[FloatArray, FloatArray]) -> State:
     return replace(state, weights=(1.0 + gains / (ADJUSTMENT.quarter_weight_gain * scale)) ** -2, scale=scale)
 
 
-def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> tuple[FloatArray, ...]:
-    """Eliminate the poses from the systems of all pairs (`pair_systems`) by the Schur complement::
+def eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> tuple[FloatArray, ...]:
+    """Eliminate the poses, the last unknowns, from the systems of all pairs (`pair_systems`) by the Schur complement::
 
         A = | U   W |     (U - W V^-1 W') d_cameras = b_cameras - W V^-1 b_pose
             | W'  V |
 
-    The damping of V is relative to its diagonal. Return the reduced Hessians (P, 10, 10) and gradients (P, 10), and
-    for back substitution V^-1 W' (P, 5, 10) and V^-1 b_pose (P, 5).
+    The damping of V is relative to its diagonal. Return the reduced Hessians (P, n, n) and gradients (P, n) of the n
+    parameters of cameras, and for back substitution V^-1 W' (P, 5, n) and V^-1 b_pose (P, 5).
     """
-    n = 2 * CAMERA
+    n = b.shape[1] - POSE_DOF
     V = A[:, n:, n:].copy()
     diagonal = np.arange(V.shape[-1])
     # few or degenerate matches leave a pose undetermined: the damping must not vanish beside the largest entry
@@ -413,7 +389,7 @@ def _take_step(
 
     def attempt(damping: float) -> State | None:
         # cameras from all pairs and the prior, then each pose from its pair
-        hessians, gradients, pose_by_cameras, pose_alone = _eliminate_poses(*system, damping)
+        hessians, gradients, pose_by_cameras, pose_alone = eliminate_poses(*system, damping)
         H, g = matches.assemble(Information(hessians, gradients, np.empty(0)), factors)
         H += np.diag(prior.precision.ravel())
         g += (prior.precision * (prior.mean - state.thetas)).ravel()

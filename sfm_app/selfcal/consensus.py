@@ -146,14 +146,30 @@ class Consensus:
         Nelder-Mead, because the consensus has a cusp wherever a pair is satisfied exactly. For every sigma it runs a
         second time, from the end of the first with a tenth of its steps: a simplex can stall on a ridge.
         """
-        theta, value, first_steps = start.copy(), 0.0, np.array(CONSENSUS.first_steps)
+        theta, value, places = start.copy(), 0.0, list(free)
+        steps = np.diag(CONSENSUS.first_steps)[places]
         for sigma in sigmas:
-            for steps in (first_steps, 0.1 * first_steps):
-                simplex = np.tile(theta, (len(free) + 1, 1))
-                for row, index in enumerate(free):
-                    simplex[row + 1, index] += steps[index]
-                theta, value = _climb(self._packed, self.weights, self.center_sigma, simplex, sigma)
+            for scale in (1.0, 0.1):
+                simplex = np.concatenate([theta[None], theta + scale * steps])
+                theta, value = self._climb_once(simplex, places, sigma)
         return theta, value
+
+    def _climb_once(self, simplex: FloatArray, places: list[int], sigma: float) -> tuple[FloatArray, float]:
+        """Find a maximum by Nelder and Mead (1965) from a simplex (n + 1, 4) along n places."""
+        from scipy.optimize import minimize
+
+        theta = simplex[0].copy()
+
+        def cost(free: FloatArray) -> float:
+            theta[places] = free
+            return -_value(self._packed, self.weights, self.center_sigma, theta, sigma)
+
+        end = minimize(
+            cost, simplex[0, places], method="Nelder-Mead",
+            options={"initial_simplex": simplex[:, places], "xatol": 1e-5, "fatol": 1e-6, "maxiter": 300},
+        )  # fmt: skip
+        theta[places] = end.x
+        return theta, -float(end.fun)
 
 
 @kernel
@@ -183,84 +199,6 @@ def _values(
     for k in range(len(thetas)):
         values[k] = _value(packed, weights, center_sigma, thetas[k], sigma)
     return values
-
-
-@kernel
-def _climb(
-    packed: FloatArray, weights: FloatArray, center_sigma: float, simplex: FloatArray, sigma: float
-) -> tuple[FloatArray, float]:
-    """Find a maximum by Nelder and Mead (1965) from a simplex (n + 1, 4), with their coefficients 1, 2, 1/2, 1/2."""
-    count = len(simplex)
-    values = _values(packed, weights, center_sigma, simplex, sigma)
-    for _ in range(300):
-        _sort(simplex, values)
-        if values[0] - values[-1] <= 1e-6 and _extent(simplex) <= 1e-5:
-            break
-        worst = values[-1]
-        trial = _reflect(simplex, 1.0)
-        value = _value(packed, weights, center_sigma, trial, sigma)
-        if value > values[0]:
-            further = _reflect(simplex, 2.0)
-            better = _value(packed, weights, center_sigma, further, sigma)
-            if better > value:
-                trial, value = further, better
-        elif value <= values[-2]:
-            floor = max(value, worst)
-            trial = _reflect(simplex, 0.5 if value > worst else -0.5)
-            value = _value(packed, weights, center_sigma, trial, sigma)
-            if value <= floor:
-                for k in range(1, count):
-                    for column in range(4):
-                        simplex[k, column] = 0.5 * (simplex[0, column] + simplex[k, column])
-                    values[k] = _value(packed, weights, center_sigma, simplex[k], sigma)
-                continue
-        _copy(trial, simplex[-1])
-        values[-1] = value
-    _sort(simplex, values)
-    return simplex[0].copy(), float(values[0])
-
-
-@kernel
-def _sort(simplex: FloatArray, values: FloatArray) -> None:
-    """Sort in place, highest first; equal values keep their order. Loops compile faster than argsort."""
-    for k in range(1, len(values)):
-        row, value = simplex[k].copy(), values[k]
-        i = k
-        while i > 0 and values[i - 1] < value:
-            _copy(simplex[i - 1], simplex[i])
-            values[i] = values[i - 1]
-            i -= 1
-        _copy(row, simplex[i])
-        values[i] = value
-
-
-@kernel
-def _copy(row: FloatArray, place: FloatArray) -> None:
-    """Copy a row; assigning rows compiles for a second and a half."""
-    for column in range(4):
-        place[column] = row[column]
-
-
-@kernel
-def _reflect(simplex: FloatArray, factor: float) -> FloatArray:
-    """Return the last corner reflected at the centroid of the others, its distance scaled by `factor`."""
-    trial = np.empty(4)
-    for column in range(4):
-        middle = 0.0
-        for k in range(len(simplex) - 1):
-            middle += simplex[k, column]
-        middle /= len(simplex) - 1
-        trial[column] = middle + factor * (middle - simplex[-1, column])
-    return trial
-
-
-@kernel
-def _extent(simplex: FloatArray) -> float:
-    extent = 0.0
-    for k in range(1, len(simplex)):
-        for column in range(4):
-            extent = max(extent, abs(simplex[k, column] - simplex[0, column]))
-    return extent
 
 
 # The search: a coarse grid over K, then local searches from its best cells (ours, in place of thesis 5.8.4).

@@ -37,7 +37,7 @@ from sfm_app.selfcal.pairs import (
 )
 from sfm_app.selfcal.priors import PRIORS, CameraPriors, TiedPriors
 from sfm_app.settings import CalibrationSettings
-from sfm_app.types import Calibration, CameraPairs, PairId
+from sfm_app.types import Calibration, CameraPairs
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 LEAST_PAIRS_OF_SEVERAL = 2
@@ -189,20 +189,6 @@ class CameraGroup:
     """Whether it was split from photos of one size: then each of its photos must support it."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Joint:
-    """All cameras fitted at once, and the evidence for the verdict on each."""
-
-    fit: Fit
-    covariance: FloatArray
-    """(5C, 5C)."""
-    tables: VoteTables
-    photos: list[PairId]
-    unit_px: float
-    motion: str
-    """A critical motion of most pairs, which leaves all focals open; empty for none."""
-
-
 def calibrate_cameras(
     cameras: Sequence[CameraGroup], pairs: CameraPairs, members: IndexArray, options: CalibrationSettings, method: str
 ) -> list[Calibration]:
@@ -227,8 +213,8 @@ def calibrate_cameras(
         thetas = _find_focals(thetas, unknown, VoteTables(Fs, members, weights), priors)
     fit = fit_cameras(matches, Fs, [thetas], priors)
     tables = VoteTables(undistorted_fundamentals(fit), members, weights)
-    joint = _Joint(fit, covariance(fit, sides), tables, photos, unit, critical_motion(fit))
-    calibrations = [_judge_camera(k, camera, joint, method) for k, camera in enumerate(cameras)]
+    cov = covariance(fit, sides)
+    calibrations = [_judge_camera(k, camera, fit, cov, tables, method) for k, camera in enumerate(cameras)]
     camera_of = dict(zip(photos, members.tolist(), strict=True))
     order = key_pairs(fit, tuple(photos))
     return [
@@ -237,13 +223,16 @@ def calibrate_cameras(
     ]
 
 
-def _judge_camera(index: int, camera: CameraGroup, joint: _Joint, method: str) -> Calibration:
-    fit, unit = joint.fit, joint.unit_px
-    theta = fit.state.thetas[index]
+def _judge_camera(
+    index: int, camera: CameraGroup, fit: Fit, covariances: FloatArray, tables: VoteTables, method: str
+) -> Calibration:
+    """Return the verdict on one camera of a joint fit with these covariances (5C, 5C)."""
+    theta, unit = fit.state.thetas[index], fit.matches.unit_px
     block = slice(CAMERA * index, CAMERA * (index + 1))
+    cov = covariances[block, block]
     own = np.flatnonzero((fit.matches.cameras == index).any(axis=1))
-    margin, support = _margin(index, fit.state.thetas, joint.tables)
-    spread = float(np.sqrt(joint.covariance[block, block][LOG_FOCAL, LOG_FOCAL]))
+    margin, support = _margin(index, fit.state.thetas, tables)
+    spread = float(np.sqrt(cov[LOG_FOCAL, LOG_FOCAL]))
     evidence = {
         "pairs": float(len(own)),
         "support": support,
@@ -260,7 +249,7 @@ def _judge_camera(index: int, camera: CameraGroup, joint: _Joint, method: str) -
         reason = "the pairs fit other focals as well or better"
     # a motion that leaves the focal open is the reason only where the deviation is small
     elif (camera.family >= 0 or camera.divided) and not (camera.divided and uncertain):
-        reason = joint.motion
+        reason = critical_motion(fit)
     side = max(camera.size) / unit
     in_sides = np.array([theta[LOG_FOCAL] - np.log(side), theta[CENTER_U] / side, theta[CENTER_V] / side])
     reason = reason or rejection_reason(in_sides, spread, camera.size)
@@ -275,14 +264,14 @@ def _judge_camera(index: int, camera: CameraGroup, joint: _Joint, method: str) -
     calibration = downgrade_to_estimate(
         replace(
             calibration_from_parameters(theta, camera.size, method, unit),
-            **camera_uncertainty(theta, joint.covariance[block, block], unit),
+            **camera_uncertainty(theta, cov, unit),
             evidence=evidence,
             held=fit.held_names(index),
         ),
         uncertain,
     )
     if calibration.identifiable and camera.divided:
-        least = _least_shares(fit.state.thetas, joint.tables, joint.photos).get(index, 0.0)
+        least = _least_share(index, fit.state.thetas, tables, fit.matches.photos)
         if least < GROUPS.fair_share or support < GROUPS.least_support:
             return downgrade_to_estimate(calibration, "some of its photos do not support it")
     return calibration
@@ -343,17 +332,12 @@ def _margin(index: int, thetas: FloatArray, tables: VoteTables) -> tuple[float, 
     return float(total[0] - np.max(rivals)), float(total[0] / most) if most > 0 else 0.0
 
 
-def _least_shares(thetas: FloatArray, tables: VoteTables, photos: Sequence[PairId]) -> dict[int, float]:
-    """Return by camera the smallest share of possible votes that the pairs of one of its photos give."""
-    sums: dict[tuple[int, int], float] = {}
-    most: dict[tuple[int, int], float] = {}
+def _least_share(index: int, thetas: FloatArray, tables: VoteTables, photos: IndexArray) -> float:
+    """Return the smallest share of possible votes that the pairs of one photo of a camera give; 0 without pairs."""
+    totals: dict[int, FloatArray] = {}
     for k, (i, j) in enumerate(tables.members):
-        pair = photos[tables.indices[k]]
         votes = float(tables.votes(k, thetas[i][None], thetas[j][None], CONSENSUS.sigmas[0])[0, 0])
-        for key in ((int(i), pair[0]), (int(j), pair[1])):
-            sums[key] = sums.get(key, 0.0) + votes
-            most[key] = most.get(key, 0.0) + float(tables.weights[k])
-    least: dict[int, float] = {}
-    for (camera, _), share in ((key, sums[key] / most[key]) for key in sums):
-        least[camera] = min(share, least.get(camera, 1.0))
-    return least
+        for camera, photo in zip((i, j), photos[tables.indices[k]].tolist(), strict=True):
+            if camera == index:
+                totals[photo] = totals.get(photo, np.zeros(2)) + np.array([votes, tables.weights[k]])
+    return min((float(votes / most) for votes, most in totals.values()), default=0.0)

@@ -26,6 +26,7 @@ from sfm_app.selfcal.pairs import (
     guess_calibration,
     parameters_from_calibration,
     prepare,
+    sides_from_pixels,
 )
 from sfm_app.selfcal.zero_curves import METHOD
 from sfm_app.settings import CalibrationSettings
@@ -176,7 +177,7 @@ def _mixed_padded_groups(whole: Sequence[CalibratedCamera], pairs: PhotoPairs, s
         rows = [k for k, pair in enumerate(pairs.photos) if labels.keys() >= set(pair)]
         if len(groups) == 1 or not rows:
             continue
-        to_px = {photo: _sides_to_pixels(pairs.sizes[photo]) for photo in labels}
+        to_px = {photo: np.linalg.inv(sides_from_pixels(pairs.sizes[photo])) for photo in labels}
         Fs = [to_px[second].T @ pairs.Fs[k] @ to_px[first] for k in rows for first, second in (pairs.photos[k],)]
         padded = CameraPairs.from_Fs(np.array(Fs), (1, 1), pairs.weights[rows])
         ready = prepare(padded, unit_px=1.0, origin_px=(0.0, 0.0))
@@ -185,12 +186,6 @@ def _mixed_padded_groups(whole: Sequence[CalibratedCamera], pairs: PhotoPairs, s
         if len(photos) and divide_photos(tables, photos, [], seed, labels).is_camera_per_photo:
             families |= dict.fromkeys((camera.name for camera in groups), number)
     return families
-
-
-def _sides_to_pixels(size: tuple[int, int]) -> FloatArray:
-    """Return the (3, 3) transform from longer sides, from the middle, to pixels."""
-    side = float(max(size))
-    return np.array([[side, 0.0, size[0] / 2], [0.0, side, size[1] / 2], [0.0, 0.0, 1.0]])
 
 
 def _calibrate_from_all_pairs(

@@ -16,11 +16,19 @@ from numpy.typing import NDArray
 
 from sfm_app.camera import rows as families
 from sfm_app.camera.projection import RAY, Fisheye, image_rays
-from sfm_app.geometry.epipolar import FIRST, SECOND, decompose_essential, fit_rays, signed_distances, squared_distances
+from sfm_app.geometry.epipolar import (
+    FIRST,
+    SECOND,
+    cross_matrix,
+    decompose_essential,
+    fit_rays,
+    signed_distances,
+    squared_distances,
+)
 from sfm_app.geometry.least_squares import damped_step, inverse_of_positive, solve_each
-from sfm_app.geometry.poses import POSE_DOF, retract, write_essential
+from sfm_app.geometry.poses import POSE_DOF, retract, write_nearby_essentials
 from sfm_app.numerical import MAD_TO_SIGMA
-from sfm_app.selfcal.adjustment import DAMPING, ROBUST_SCALE
+from sfm_app.selfcal.adjustment import DAMPING, ROBUST_SCALE, eliminate_poses
 from sfm_app.types.arrays import FloatArray, IndexArray
 
 # Lenses: from points of a photo to directions, also behind the camera.
@@ -176,6 +184,8 @@ def _supports(Fs: FloatArray, lines: FloatArray, threshold: float) -> FloatArray
 Family = type[Fisheye] | type[RadialLens]
 Pair = tuple[FloatArray, FloatArray]
 """Matches (N, 4) and F (3, 3) of a pair."""
+System = tuple[FloatArray, FloatArray]
+"""Hessian and negative gradient of one pair, or of all pairs."""
 
 
 class State(NamedTuple):
@@ -207,19 +217,6 @@ class RefinedLens(NamedTuple):
     sigma: float
 
 
-class System(NamedTuple):
-    """Normal equations of one pair."""
-
-    H: FloatArray
-    """(4, 4) in the lens, the pose eliminated."""
-    g: FloatArray
-    """(4,) negative gradient."""
-    pose_by_lens: FloatArray
-    """(5, 4): its product with the step of the lens is subtracted from the step of the pose."""
-    pose_alone: FloatArray
-    """(5,) step of the pose if the lens does not move."""
-
-
 def refine_lens(start: Lens, pairs: Sequence[Pair], sigma: float) -> RefinedLens:
     """Return the lens of the family of `start` with the least robust cost, with its covariance, in longer sides.
 
@@ -236,10 +233,8 @@ def refine_lens(start: Lens, pairs: Sequence[Pair], sigma: float) -> RefinedLens
         state = _adjust(matches, state, sigma)
         distances = np.abs(np.concatenate(_distances(matches, state)))
         sigma = max(MAD_TO_SIGMA * float(np.median(distances)), REFINEMENT.least_sigma)
-    systems = _systems(matches, state, sigma)
-    H = sum((system.H for system in systems), np.diag(_prior_precision()))
-    inverse = inverse_of_positive(H)
-    scores = np.array([system.g for system in systems])
+    hessians, scores, _, _ = eliminate_poses(*_normal_equations(matches, state, sigma), 0.0)
+    inverse = inverse_of_positive(hessians.sum(axis=0) + np.diag(_prior_precision()))
     small_sample = len(pairs) / max(len(pairs) - LENS, 1)
     sandwich = small_sample * inverse @ (scores.T @ scores) @ inverse
     plain = redundancy(matches) * inverse
@@ -261,10 +256,10 @@ def _prior_precision() -> FloatArray:
 def _adjust(matches: Sequence[FloatArray], state: State, sigma: float) -> State:
     damping = DAMPING.first
     for _ in range(REFINEMENT.rounds):
-        systems, cost = _systems(matches, state, sigma), robust_cost(matches, state, sigma)
+        system, cost = _normal_equations(matches, state, sigma), robust_cost(matches, state, sigma)
 
-        def attempt(damping: float, begin: State = state, systems: list[System] = systems) -> State | None:
-            trial = _step(begin, systems, damping)
+        def attempt(damping: float, begin: State = state, system: System = system) -> State | None:
+            trial = _step(begin, system, damping)
             if abs(trial.parameters[0]) > REFINEMENT.most_log_focal:
                 return None
             return trial if robust_cost(matches, trial, sigma) < cost else None  # noqa: B023 -- called in this round
@@ -279,37 +274,35 @@ def _adjust(matches: Sequence[FloatArray], state: State, sigma: float) -> State:
     return state
 
 
-def _step(state: State, systems: list[System], damping: float) -> State:
+def _step(state: State, system: System, damping: float) -> State:
     """Return the state after one damped step: the lens by all pairs and the prior, then each pose by its pair."""
     prior = _prior_precision()
-    H = sum((system.H for system in systems), np.diag(prior))
-    g = sum((system.g for system in systems), -prior * state.parameters)
+    hessians, gradients, pose_by_lens, pose_alone = eliminate_poses(*system, 0.0)
+    H, g = hessians.sum(axis=0) + np.diag(prior), gradients.sum(axis=0) - prior * state.parameters
     step = solve_each(H + damping * np.diag(np.diag(H)), g[:, None])[:, 0]
-    poses = tuple(
-        np.asarray(retract(pose, system.pose_alone - system.pose_by_lens @ step), np.float64)
-        for pose, system in zip(state.poses, systems, strict=True)
-    )
+    moved = zip(state.poses, pose_alone - pose_by_lens @ step, strict=True)
+    poses = tuple(np.asarray(retract(pose, of_pose), np.float64) for pose, of_pose in moved)
     return State(state.parameters + step, poses, state.family)
 
 
-def _systems(matches: Sequence[FloatArray], state: State, sigma: float) -> list[System]:
+def _normal_equations(matches: Sequence[FloatArray], state: State, sigma: float) -> System:
+    """Return the Gauss-Newton systems (P, 9, 9) and (P, 9) of all pairs over the lens and the pose."""
     lenses = [state.lens, *(state.lens_at(state.parameters + STEP * axis) for axis in np.eye(LENS))]
-    return [_system(x, lenses, pose, sigma) for x, pose in zip(matches, state.poses, strict=True)]
+    systems = [_pair_system(x, lenses, pose, sigma) for x, pose in zip(matches, state.poses, strict=True)]
+    return np.array([A for A, _ in systems]), np.array([b for _, b in systems])
 
 
-def _system(x: FloatArray, lenses: list[Lens], pose: FloatArray, sigma: float) -> System:
-    (lens, *steps), E = lenses, _essential(pose)
+def _pair_system(x: FloatArray, lenses: list[Lens], pose: FloatArray, sigma: float) -> System:
+    Es = np.empty((1 + POSE_DOF, 3, 3))
+    write_nearby_essentials(pose, STEP, Es)
+    (lens, *steps), (E, *turned) = lenses, Es
     pair = bearings_through(lens, x)
     r = signed_distances(E, pair)
     by_lens = [signed_distances(E, bearings_through(other, x)) - r for other in steps]
-    by_pose = [signed_distances(_essential(retract(pose, STEP * axis)), pair) - r for axis in np.eye(POSE_DOF)]
+    by_pose = [signed_distances(other, pair) - r for other in turned]
     J, r = np.column_stack(by_lens + by_pose) / (STEP * sigma), r / sigma
     weights = (1.0 + (r / ROBUST_SCALE) ** 2) ** -2
-    H, g = (J * weights[:, None]).T @ J, -J.T @ (weights * r)
-    U, W, V = H[:LENS, :LENS], H[:LENS, LENS:], H[LENS:, LENS:]
-    solved = np.linalg.solve(V + 1e-9 * np.trace(V) * np.eye(POSE_DOF), np.column_stack([W.T, g[LENS:]]))
-    pose_by_lens, pose_alone = solved[:, :LENS], solved[:, LENS]
-    return System(U - W @ pose_by_lens, g[:LENS] - W @ pose_alone, pose_by_lens, pose_alone)
+    return (J * weights[:, None]).T @ J, -J.T @ (weights * r)
 
 
 def robust_cost(matches: Sequence[FloatArray], state: State, sigma: float) -> float:
@@ -326,14 +319,8 @@ def pair_costs(matches: Sequence[FloatArray], state: State, sigma: float) -> Flo
 
 def _distances(matches: Sequence[FloatArray], state: State) -> list[FloatArray]:
     lens = state.lens
-    pairs = zip(matches, state.poses, strict=True)
-    return [signed_distances(_essential(pose), bearings_through(lens, x)) for x, pose in pairs]
-
-
-def _essential(pose: FloatArray) -> FloatArray:
-    E = np.empty((3, 3))
-    write_essential(pose, E)
-    return E
+    Es = [cross_matrix(pose[9:]) @ pose[:9].reshape(3, 3) for pose in state.poses]
+    return [signed_distances(E, bearings_through(lens, x)) for E, x in zip(Es, matches, strict=True)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,23 +29,22 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
                 grow_database(place.database, run.earlier.place.database, photos, run.earlier.known)
         marker.write_text(run.fingerprint, encoding="utf-8", newline="\n")
     method = run.plugins.feature_method(options.features)
-    in_force = find_all_features(method, run)
+    find_all_features(method, run)
     if run.earlier is not None:
         changed = forget_changed_matches(place.database, run.earlier.place.database)
         earlier = run.earlier.with_replaced(changed)
         run = replace(run, earlier=earlier)
         run.record(known_photos=len(earlier.known), new_photos=len(earlier.new), gone_photos=len(earlier.gone))
     if wants_all_pairs(len(photos.photos), options):
-        in_force |= match_pairs(method, run)
+        match_pairs(method, run)
     else:
-        in_force |= match_probable_pairs(method, lambda: read_matches(photos, place), run)
+        match_probable_pairs(method, lambda: read_matches(photos, place), run)
     forget_features(run)
     graph = read_matches(photos, place)
     run.record(
         keypoints={graph.images[key].name: len(points) for key, points in graph.keypoints.items()},
         pairs=len(graph.matches),
         matches=sum(len(rows) for rows in graph.matches.values()),
-        colmap=in_force,
     )
     marker.unlink()
     if not graph.matches:

@@ -144,7 +144,7 @@ def span_surface(records: NDArray[np.void], bounds: FloatArray, cube: Cube, plac
         anchors[letter] = cube.anchors[:, axis]
         anchors[f"n{letter}"] = 3.0**-0.5
     with tempfile.TemporaryDirectory(dir=place, prefix="poisson-") as scratch:
-        write_points(np.concatenate([anchors, records]), Path(scratch) / FUSED)
+        write_points([anchors, records], Path(scratch) / FUSED)
         raw = poisson_surface(Path(scratch), cube.depth)
     inside = ((raw.vertices >= bounds[0]) & (raw.vertices <= bounds[1])).all(axis=1)
     return select_faces(raw, inside[raw.faces].all(axis=1)), len(raw.faces)

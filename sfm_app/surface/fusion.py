@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.dense import map_file, normals_file, read_depth, write_depth, write_fusion_views
-from sfm_app.colmap.surface import fuse, join_points
+from sfm_app.colmap.surface import fuse, open_points, write_points
 from sfm_app.files import fingerprint, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.meshing.blocks import split_points
 from sfm_app.operating_system import share_bytes
@@ -71,7 +71,7 @@ def fuse_maps(dense_dir: Path, views: Sequence[View], min_views: int, target: Pa
     run.record(fusion_blocks=len(tasks))
     run.map(Task(fuse_block), tasks, "fusing depth maps in blocks")
     with replace_atomically(target) as path:
-        join_points([task.path for task in tasks if task.path.stat().st_size], path)
+        write_points([open_points(task.path) for task in tasks if task.path.stat().st_size], path)
     shutil.rmtree(folder)
 
 

@@ -41,7 +41,7 @@ def make_run(tmp_path):
         for key in ("x", "y", "z"):
             cloud[key] = rng.uniform(-3.0, 5.0, points)
         cloud["nx"], cloud["red"], cloud["blue"] = 1.0, 250, rng.integers(0, 256, points)
-        write_points(cloud, place.surface / "fused.ply")
+        write_points([cloud], place.surface / "fused.ply")
         corners, faces = np.eye(3), np.array([[0, 1, 2]])
         np.savez(place.surface / "surface.npz", vertices=corners, faces=faces, colors=np.zeros((3, 3)))
         place.scale.write_text(json_text(MetricFrame().to_dict()), encoding="utf-8")

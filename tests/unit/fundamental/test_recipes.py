@@ -12,7 +12,7 @@ from sfm_app.fundamental.lev_ransac import fit_lev_ransac, search_patience
 from sfm_app.fundamental.loop import run_loop
 from sfm_app.fundamental.points import prepare
 from sfm_app.fundamental.rays import fit_lev_ransac_rays, validity
-from sfm_app.fundamental.recipes import RECIPES, median_sigma, recipe_estimator
+from sfm_app.fundamental.recipes import RECIPES, fit_by_name, median_sigma
 from sfm_app.geometry.epipolar import cross_matrix, decompose_essential, sampson_distance
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
@@ -51,7 +51,7 @@ def test_lmeds_draws_for_half_outliers_and_holds_up_to_there():
     assert (trials_of("lmeds", 0.1, range(2)) == expected).all()
     for seed in range(3):
         pair = make_pair(PairOptions(points=600, outliers=0.4), seed)
-        fit = recipe_estimator("lmeds")(pair.x1, pair.x2, OPTIONS, seed)
+        fit = fit_by_name("lmeds", pair.x1, pair.x2, OPTIONS, seed)
         assert sampson_distance(fit.F, pair.exact_x1, pair.exact_x2).mean() < 0.4
 
 

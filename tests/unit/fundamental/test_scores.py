@@ -20,7 +20,6 @@ from sfm_app.fundamental.scores import (
     penalty,
     ransac,
     residual_validity,
-    select,
     squared_distances,
     squared_sampson_distance,
     validity_from_residuals,
@@ -99,14 +98,6 @@ def test_a_gate_asks_after_its_own_stride():
     ]:
         turned = penalty(points, 0, SHIFT, loss, np.inf, make_pretest(np.array(least), 1, random_start=False))
         assert (turned < np.inf) == passes
-
-
-@pytest.mark.parametrize("count", [1, 2, 9, 10, 1001])
-def test_quickselect_agrees_with_sorting(count):
-    rng = np.random.default_rng(count)
-    for values in (rng.normal(size=count), rng.integers(0, 3, count).astype(float)):
-        for rank in {0, count // 2, count - 1}:
-            assert select(values.copy(), rank) == np.sort(values)[rank]
 
 
 def test_a_soft_penalty_still_counts_inliers_for_the_gate():
