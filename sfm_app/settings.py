@@ -129,7 +129,7 @@ class CalibrationSettings(Section):
 
 
 HypothesisName = Literal[
-    "false-joins", "colmap-defaults", "other-focals", "camera-per-photo", "two-cameras", "learned-cameras",
+    "false-joins", "colmap-defaults", "other-focals", "camera-per-photo", "learned-cameras",
     "merged-models", "finer-features", "mapped-anew", "look-alikes", "global-mapper", "splits", "lens-families",
     "rolling-shutter",
 ]  # fmt: skip
@@ -138,7 +138,6 @@ HYPOTHESES: Mapping[HypothesisName, str] = {
     "colmap-defaults": "COLMAP's default pipeline",
     "other-focals": "other focal lengths",
     "camera-per-photo": "a camera for each photo (a zoom, or several devices)",
-    "two-cameras": "two cameras",
     "learned-cameras": "mapping again with the cameras of the model",
     "merged-models": "merging models",
     "finer-features": "finer features for unplaced photos",

@@ -5,13 +5,12 @@ features. The loop keeps an outcome that explains more.
 """
 
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain, count
 
 import numpy as np
 
-from sfm_app.camera.models import guessed_camera_matrix
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import write_match_graph
 from sfm_app.colmap.model import cameras_by_photo, posed_photo_ids
@@ -298,53 +297,6 @@ def _free_names(name: str, taken: Collection[str]) -> Iterable[str]:
     return chain([name], (other for number in count(2) if (other := f"{name} #{number}") not in taken))
 
 
-# Two cameras instead of one per photo.
-
-
-def _two_cameras_reason(best: Outcome, _: Mapper) -> str:
-    last = best.trials[-1] if best.trials else None
-    if last is None or last.name != "camera-per-photo" or not last.accepted or _two_cameras(best) is None:
-        return ""
-    return "the focal lengths fall into two groups"
-
-
-def _with_two_cameras(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
-    intrinsics = _two_cameras(best)
-    if intrinsics is not None:
-        yield mapper.map(replace(best.trusted, intrinsics=intrinsics)).with_earlier(best)
-
-
-def _two_cameras(best: Outcome) -> Intrinsics | None:
-    """Replace the cameras of photos of one size by two, divided at the widest gap of focals; None if none can be."""
-    if best.main is None:
-        return None
-    evidence, each = best.evidence, best.evidence.intrinsics
-    of_size: dict[tuple[int, int], dict[str, float]] = {}
-    for photo, (K, *_) in cameras_by_photo(best.main.model).items():
-        name, camera = evidence.camera_name(photo), evidence.camera(photo)
-        if not camera.identifiable:
-            of_size.setdefault((camera.width, camera.height), {})[name] = float(K[0, 0] * K[1, 1]) ** 0.5
-    cameras = dict(each.cameras)
-    replacements: dict[str, str] = {}
-    for size, focals in of_size.items():
-        for group in _split_at_gap(focals):
-            K = guessed_camera_matrix(size, float(np.median([focals[name] for name in group])))
-            cameras[group[0]] = replace(cameras[group[0]], K=K, identifiable=True, reason="", method="mapping")
-            replacements |= dict.fromkeys(group[1:], group[0])
-    camera_of = {photo: replacements.get(name, name) for photo, name in each.camera_of.items()}
-    used = {name: camera for name, camera in cameras.items() if name not in replacements}
-    return replace(each, cameras=used, camera_of=camera_of) if replacements else None
-
-
-def _split_at_gap(focals: Mapping[str, float]) -> list[list[str]]:
-    """Return names in two parts, divided at the widest gap between focals; empty if a part has only one name."""
-    names = sorted(focals, key=lambda name: (focals[name], name))
-    if len(names) < OPTIONS.min_photos:
-        return []
-    gap = int(np.argmax(np.diff(np.log([focals[name] for name in names])))) + 1
-    return [names[:gap], names[gap:]] if 2 <= gap <= len(names) - 2 else []
-
-
 # The cameras of the model, which correct the relative poses.
 
 
@@ -425,7 +377,6 @@ FIRST_LOOK = (
     Hypothesis("false-joins", _false_joins_reason, _without_false_joins, repeats=OVERLAPS.max_passes),
     Hypothesis("other-focals", _focal_reason, _with_other_focals),
     Hypothesis("camera-per-photo", _shared_camera_reason, _with_camera_per_photo),
-    Hypothesis("two-cameras", _two_cameras_reason, _with_two_cameras),
     Hypothesis("learned-cameras", _learning_reason, _with_learned_cameras),
     Hypothesis("merged-models", _merge_reason, _merged),
     RIVAL,

@@ -13,7 +13,7 @@ from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import BackendError, ClusterError, ConfigError, NumericalError
 from sfm_app.mapping.attempt import Attempt, PairSupport
 from sfm_app.mapping.hypotheses import ALL, OPTIONS, is_better, learned_intrinsics
-from sfm_app.mapping.passes import Mapper, Mappers, Outcome, Trial
+from sfm_app.mapping.passes import Mapper, Mappers, Outcome
 from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.settings import HYPOTHESES, HypothesisName, Settings
 from sfm_app.types import Evidence, LookAlikes, MatchedImage, MatchGraph, PoseGraph, ViewGraph
@@ -118,8 +118,8 @@ def test_a_lost_cluster_and_a_bug_of_ours_are_not_hidden(synthetic, run, cameras
 
 def test_every_hypothesis_can_be_switched_off():
     assert {one.name for one in ALL} < set(get_args(HypothesisName)) == HYPOTHESES.keys()
-    for names in ("two-cameras", "two-cameras, finer-features", ["two-cameras"]):
-        assert Settings.from_mapping({"scene": {"without": names}}).scene.without[0] == "two-cameras"
+    for names in ("false-joins", "false-joins, finer-features", ["false-joins"]):
+        assert Settings.from_mapping({"scene": {"without": names}}).scene.without[0] == "false-joins"
     with pytest.raises(ConfigError, match="finer-features"):
         Settings.from_mapping({"scene": {"without": "nonsense"}})
 
@@ -319,7 +319,7 @@ def chain(number):
     return ViewGraph({(k, k + 1): fit for k in range(1, number)}, {})
 
 
-PER_PHOTO, TWO = hypothesis("camera-per-photo"), hypothesis("two-cameras")
+PER_PHOTO = hypothesis("camera-per-photo")
 
 
 def is_asked(best, **settings):
@@ -468,44 +468,6 @@ def test_photos_of_one_camera_keep_it_and_so_does_the_database(run, cameras, map
     found = mapped.outcome(guess, run(), hypotheses=[replace(PER_PHOTO, reason=lambda *_: "a doubt")])
     assert asked == [1, 6] and trials_of(found)[-1][:2] == ("camera-per-photo", False)
     assert found.evidence.intrinsics is guess and cameras_in(run().workspace.database) == 1
-
-
-# Two cameras.
-
-
-@pytest.fixture
-def after_camera_per_photo(synthetic, run, cameras, mapped):
-    """Makes an outcome with a camera per photo, whose photos have these focals."""
-
-    def make(focals, *, accepted=True):
-        each = mapped(None)
-        shared = mapped.best(cameras(**GUESS), run(), attempt(synthetic.copy(), 2))
-        mapped.improve(shared, PER_PHOTO)
-        trial = Trial(PER_PHOTO.name, "a doubt", accepted, (6, 6), (1.0, 2.0), 0.0)
-        return mapped.best(each[0][1], shared.run, attempt(FakeModel(*focals), 0), trials=(trial,))
-
-    return make
-
-
-def test_photos_of_two_focals_get_two_cameras(synthetic, mapped, after_camera_per_photo):
-    best = after_camera_per_photo([1000.0, 1300.0, 1010.0, 1310.0, 990.0, 1290.0])
-    seen = mapped(None)
-    mapped.improve(best, TWO)
-    ((_, two),) = seen
-    names = {photo: two.camera_name(synthetic.matches.images[photo]) for photo in range(1, 7)}
-    assert len(two.cameras) == 2 and names[1] == names[3] == names[5] != names[2] == names[4] == names[6]
-    assert [two.cameras[names[photo]].focal_px for photo in (1, 2)] == pytest.approx([1000.0, 1300.0])
-    assert all(camera.identifiable and camera.method == "mapping" for camera in two.cameras.values())
-
-
-def test_a_single_photo_of_another_focal_is_no_second_camera(after_camera_per_photo):
-    assert TWO.reason(after_camera_per_photo([1000.0, 1005.0, 1010.0, 1310.0, 990.0, 1001.0]), None) == ""
-
-
-def test_two_cameras_are_tried_only_where_a_camera_per_photo_is_better(after_camera_per_photo):
-    focals = [1000.0, 1300.0, 1010.0, 1310.0, 990.0, 1290.0]
-    assert TWO.reason(after_camera_per_photo(focals), None)
-    assert TWO.reason(after_camera_per_photo(focals, accepted=False), None) == ""
 
 
 # The cameras of the model.
