@@ -251,65 +251,50 @@ class AcrossJoins:
 # one first, and the frames are estimated again: chains do not drift where a loop closes them.
 
 
-@dataclass(frozen=True, slots=True)
-class JoinError:
-    """Difference of a similarity from the one that others imply."""
-
-    off_deg: float
-    scale: float
-    """Logarithm of the ratio of scales."""
-    shift: float
-    """As a share of the radius of the smaller fragment."""
-
-    @property
-    def excess(self) -> float:
-        """The largest of the three errors, as a multiple of its limit."""
-        return max(self.off_deg / OPTIONS.max_deg, abs(self.scale) / OPTIONS.max_scale, self.shift / OPTIONS.max_shift)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
     """Fragments in common frames."""
 
     frames: Mapping[int, Similarity]
     """From the frame of each fragment to the common one, for the largest group of joined fragments."""
-    kept: tuple[tuple[Join, JoinError], ...]
-    dropped: tuple[tuple[Join, JoinError], ...]
-    """Joins that contradict the others, with their errors when they were dropped."""
+    kept: tuple[Join, ...]
+    dropped: tuple[Join, ...]
+    """Joins that contradict the others, the worst first."""
 
 
 def align_fragments(fragments: Sequence[Fragment], joins: Sequence[Join]) -> Alignment:
     """Find a common frame for the fragments that joins connect, without joins that contradict the others."""
     radii = [fragment.radius for fragment in fragments]
     remaining = list(joins)
-    dropped: list[tuple[Join, JoinError]] = []
+    dropped: list[Join] = []
     while True:
         frames = _synchronize(remaining, len(fragments))
         implied = [frames[join.first].inverse().compose(frames[join.second]) for join in remaining]
-        errors = [difference(join, one, radii) for join, one in zip(remaining, implied, strict=True)]
+        errors = [join_error(join, one, radii) for join, one in zip(remaining, implied, strict=True)]
         # a single loop is equally far off in all of its joins: the one with least evidence goes
-        ranked = sorted(range(len(remaining)), key=lambda k: (-errors[k].excess / remaining[k].weight, k))
-        worst = next((k for k in ranked if errors[k].excess > 1.0), None)
+        ranked = sorted(range(len(remaining)), key=lambda k: (-errors[k] / remaining[k].weight, k))
+        worst = next((k for k in ranked if errors[k] > 1.0), None)
         if worst is None:
             break
-        dropped.append((remaining.pop(worst), errors[worst]))
+        dropped.append(remaining.pop(worst))
     groups = connected_groups([(join.first, join.second) for join in remaining], range(len(fragments)))
     photos = [set(fragment.placed.photos.tolist()) for fragment in fragments]
     main = max(
         groups, key=lambda group: (len(set[int]().union(*(photos[k] for k in group))), -min(group)), default=set()
     )
-    accepted = tuple(zip(remaining, errors, strict=True))
-    return Alignment({number: frames[number] for number in sorted(main)}, accepted, tuple(dropped))
+    return Alignment({number: frames[number] for number in sorted(main)}, tuple(remaining), tuple(dropped))
 
 
-def difference(join: Join, expected: Similarity, radii: Sequence[float]) -> JoinError:
-    """Return the difference of a join from another similarity; radii are in units of each fragment."""
+def join_error(join: Join, expected: Similarity, radii: Sequence[float]) -> float:
+    """Return the largest error of a join in angle, scale and shift, as multiples of their limits.
+
+    Radii are in units of each fragment.
+    """
     smaller = min(radii[join.first], expected.scale * radii[join.second])
-    return JoinError(
-        float(_angles_deg(expected.R[None], join.similarity.R[None])[0]),
-        float(np.log(join.similarity.scale / expected.scale)),
-        float(np.linalg.norm(join.similarity(join.middle) - expected(join.middle))) / max(smaller, 1e-300),
-    )
+    off_deg = float(_angles_deg(expected.R[None], join.similarity.R[None])[0])
+    log_scale = float(np.log(join.similarity.scale / expected.scale))
+    shift = float(np.linalg.norm(join.similarity(join.middle) - expected(join.middle))) / max(smaller, 1e-300)
+    return max(off_deg / OPTIONS.max_deg, abs(log_scale) / OPTIONS.max_scale, shift / OPTIONS.max_shift)
 
 
 def _synchronize(joins: Sequence[Join], count: int) -> dict[int, Similarity]:

@@ -190,9 +190,9 @@ def part_figures(group: Group, joined: JoinedParts, attempts: Sequence[MappingRe
             }
             for number, (part, result) in enumerate(zip(joined.parts, joined.results, strict=True))
         ],
-        "joins": [_join_entry(join, joined) for join, _ in aligned.kept],
+        "joins": [_join_entry(join, joined) for join in aligned.kept],
         "dropped_joins": [
-            *(_join_entry(join, joined) | {"because": "contradicts other joins"} for join, _ in aligned.dropped),
+            *(_join_entry(join, joined) | {"because": "contradicts other joins"} for join in aligned.dropped),
             *(_join_entry(join, joined) | {"because": "matches contradict it"} for join in joined.refused),
         ],
         "left_out": [joined.fragments[k].part for k in range(len(joined.fragments)) if k not in aligned.frames],
