@@ -130,7 +130,7 @@ class CalibrationSettings(Section):
 
 HypothesisName = Literal[
     "false-joins", "colmap-defaults", "other-focals", "camera-per-photo", "learned-cameras",
-    "merged-models", "finer-features", "mapped-anew", "look-alikes", "global-mapper", "splits", "lens-families",
+    "finer-features", "mapped-anew", "look-alikes", "global-mapper", "splits", "lens-families",
     "rolling-shutter",
 ]  # fmt: skip
 HYPOTHESES: Mapping[HypothesisName, str] = {
@@ -139,7 +139,6 @@ HYPOTHESES: Mapping[HypothesisName, str] = {
     "other-focals": "other focal lengths",
     "camera-per-photo": "a camera for each photo (a zoom, or several devices)",
     "learned-cameras": "mapping again with the cameras of the model",
-    "merged-models": "merging models",
     "finer-features": "finer features for unplaced photos",
     "mapped-anew": "mapping all photos again",
     "look-alikes": "leaving out pairs of look-alikes",

@@ -82,7 +82,7 @@ GROUPS: Mapping[str, Group] = {
         "docs/algorithms/mapping.md; six other sets, thinned out, only checked it",
     ),
     "a camera for each photo in mapping, scale that hangs on few points": Group(
-        ("mapping.hypotheses", "mapping.split_and_merge"),
+        ("mapping.hypotheses", "mapping.splits"),
         ("temple16", "dinoSparseRing", "castle-P19"), "trouble.py, seeds 0 to 180 and 1000 to 1031",
         "docs/algorithms/mapping.md; the photo sets chose only when a scale is called open",
     ),

@@ -8,8 +8,7 @@ import numpy as np
 
 from sfm_app.colmap.backend import all_points, pycolmap, translate_errors
 from sfm_app.colmap.bundle import drop_infinite_points, find_correspondences, improve_tracks, solve
-from sfm_app.colmap.model import bearing_vectors, move, pose_photo, posed_images, unposed_model
-from sfm_app.geometry.poses import Similarity
+from sfm_app.colmap.model import bearing_vectors, pose_photo, posed_images, unposed_model
 from sfm_app.types.arrays import FloatArray, IndexArray
 
 
@@ -85,28 +84,6 @@ def _write_cameras(model: pycolmap.Reconstruction, placed: PlacedPhotos) -> None
     for camera_id, ranked in ranked_focals.items():
         camera, known = model.cameras[camera_id], placed.cameras[sorted(ranked)[len(ranked) // 2][1]]
         camera.model, camera.params = known.model, known.params.tolist()
-
-
-def merge_models(
-    database: Path, first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, similarity: Similarity
-) -> pycolmap.Reconstruction:
-    """Return one model with the photos and points of two models that share no photo.
-
-    The first gives the frame and the parameters of shared cameras; the similarity leads from the second into it.
-    """
-    other = pycolmap.Reconstruction(second)
-    move(other, similarity)
-    model = unposed_model(database)
-    for one in (other, pycolmap.Reconstruction(first)):
-        for image in posed_images(one):
-            camera = model.cameras[image.camera_id]
-            known = one.cameras[image.camera_id]
-            camera.model, camera.params = known.model, known.params.tolist()
-            pose_photo(model, image.image_id, image.cam_from_world())
-        for key in sorted(one.points3D):
-            model.add_point3D(one.points3D[key].xyz, one.points3D[key].track, one.points3D[key].color)
-    model.tear_down()
-    return model
 
 
 def adjust_joined(model: pycolmap.Reconstruction, database: Path, refined: Sequence[int]) -> None:

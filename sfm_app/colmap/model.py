@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sfm_app.camera.models import FAMILIES, camera_matrix, projection_of_model, row_of_model
 from sfm_app.camera.projection import BEARING, RAY
 from sfm_app.camera.rows import FISHEYE, K1, PERSPECTIVE
-from sfm_app.colmap.backend import all_images, all_points, pycolmap, run_in_daemon_thread, translate_errors
+from sfm_app.colmap.backend import all_images, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.geometry.epipolar import TwoViewSeed
 from sfm_app.geometry.poses import Similarity
@@ -133,15 +133,6 @@ def submodel(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.
             part.deregister_frame(image.frame_id)
     part.tear_down()  # with frames that have no pose, no covariance can be estimated
     return part
-
-
-def points_by_keypoint(model: pycolmap.Reconstruction) -> dict[tuple[int, int], tuple[int, NDArray[np.float64]]]:
-    """Return the id and position (3,) of the 3D point of each keypoint in a track, by photo and keypoint index."""
-    return {
-        (element.image_id, element.point2D_idx): (key, np.asarray(point.xyz, np.float64))
-        for key, point in all_points(model)
-        for element in point.track.elements
-    }
 
 
 def posed_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:

@@ -1,7 +1,7 @@
 """From relative poses to a COLMAP model: all steps between calibration and the last bundle adjustment.
 
 `passes` maps all groups of photos once, and `hypotheses` tries what may explain more. `attempt` maps one group and
-scores the model, `parts` maps large groups, `look_alikes` finds merged places, and `split_and_merge` cuts models.
+scores the model, `parts` maps large groups, `look_alikes` finds merged places, and `splits` cuts models.
 `feature_retry` finds finer features for unregistered photos, and `new_photos` adds photos to an earlier model.
 """
 

@@ -27,7 +27,7 @@ from sfm_app.mapping.attempt import (
 from sfm_app.mapping.feature_retry import STEPS, Steps, find_finer_evidence, lost_photos
 from sfm_app.mapping.look_alikes import OVERLAPS, with_false_joins
 from sfm_app.mapping.passes import FIRST, MAPPERS, Mapper, Mappers, Outcome, Trial, guess_again, guessed_intrinsics
-from sfm_app.mapping.split_and_merge import merge_into_main, split_attempt
+from sfm_app.mapping.splits import split_attempt
 from sfm_app.runtime.context import RunContext
 from sfm_app.settings import HYPOTHESES, HypothesisName
 from sfm_app.types import Calibration, Evidence, Intrinsics
@@ -344,20 +344,6 @@ def _has_new_focal(before: Calibration, after: Calibration) -> bool:
     return not before.is_estimated or abs(float(np.log(after.focal_px / before.focal_px))) > OPTIONS.focal_tolerance
 
 
-# Models that share points are merged.
-
-
-def _merge_reason(best: Outcome, _: Mapper) -> str:
-    return f"the photos form {len(best.models)} models" if len(best.models) > 1 else ""
-
-
-def _merged(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
-    models = merge_into_main(best.models, best.trusted, mapper.run)
-    if len(models) < len(best.models):
-        graph = mapper.with_poses_of(models[:1], best)
-        yield replace(best, models=models, graph=graph, notes=(models[0].note,), reason=models[0].note, trials=())
-
-
 # Finer features, for photos that are unregistered.
 
 
@@ -378,7 +364,6 @@ FIRST_LOOK = (
     Hypothesis("other-focals", _focal_reason, _with_other_focals),
     Hypothesis("camera-per-photo", _shared_camera_reason, _with_camera_per_photo),
     Hypothesis("learned-cameras", _learning_reason, _with_learned_cameras),
-    Hypothesis("merged-models", _merge_reason, _merged),
     RIVAL,
 )
 FINER_FEATURES = Hypothesis("finer-features", _lost_reason, _with_finer_features)

@@ -16,7 +16,7 @@ from sfm_app.colmap.backend import Camera, Reconstruction, all_points, translate
 from sfm_app.colmap.model import focal_px, posed_images
 from sfm_app.errors import BackendError
 from sfm_app.mapping.attempt import Attempt, PairSupport, saturate
-from sfm_app.mapping.split_and_merge import OPTIONS as SPLIT
+from sfm_app.mapping.splits import OPTIONS as SPLIT
 from sfm_app.numerical import FAILURES, Json
 from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.posegraph.look_alikes import OPTIONS as LOOK_ALIKES

@@ -39,7 +39,7 @@ from sfm_app.mapping.hypotheses import (
 )
 from sfm_app.mapping.look_alikes import joined_pairs, judge_places
 from sfm_app.mapping.passes import MAPPERS, Mapper, Outcome, write_graph
-from sfm_app.mapping.split_and_merge import split_attempt
+from sfm_app.mapping.splits import split_attempt
 from sfm_app.matching.pairs import find_same_matches
 from sfm_app.posegraph import build_pose_graph
 from sfm_app.runtime.context import Earlier, RunContext

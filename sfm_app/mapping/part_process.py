@@ -14,7 +14,7 @@ from sfm_app.files import replace_atomically
 from sfm_app.mapping.attempt import MAPPING, Attempt, best_attempt, map_group
 from sfm_app.mapping.look_alikes import judge_places
 from sfm_app.mapping.part_mapping import INPUTS, RESULT, read_inputs
-from sfm_app.mapping.split_and_merge import sound_parts
+from sfm_app.mapping.splits import sound_parts
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor

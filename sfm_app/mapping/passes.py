@@ -30,7 +30,7 @@ from sfm_app.mapping.attempt import (
 )
 from sfm_app.mapping.look_alikes import OVERLAPS, joined_pairs, judge_places, with_earlier_look_alikes, with_false_joins
 from sfm_app.mapping.parts import map_in_parts, part_size, parts_suffice
-from sfm_app.mapping.split_and_merge import split_attempt
+from sfm_app.mapping.splits import split_attempt
 from sfm_app.numerical import Json
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
 from sfm_app.runtime.context import RunContext

@@ -18,7 +18,7 @@ from sfm_app.mapping.look_alikes import jumps, look_alike_entries
 from sfm_app.mapping.new_photos import GROWN, map_new_photos
 from sfm_app.mapping.passes import Outcome
 from sfm_app.mapping.rolling_shutter import follow_shutter
-from sfm_app.mapping.split_and_merge import weakly_joined_parts
+from sfm_app.mapping.splits import weakly_joined_parts
 from sfm_app.numerical import Json
 from sfm_app.products import write_scene, write_sparse_models
 from sfm_app.runtime.context import RunContext

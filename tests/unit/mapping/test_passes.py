@@ -7,7 +7,7 @@ import pytest
 from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.mapping.attempt import Attempt, NoModel
 from sfm_app.mapping.passes import Mapper, guessed_intrinsics
-from sfm_app.mapping.split_and_merge import split_attempt
+from sfm_app.mapping.splits import split_attempt
 from sfm_app.types import LookAlikes
 from tests.unit.mapping.fakes import (
     AGAINST,

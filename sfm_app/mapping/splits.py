@@ -1,24 +1,18 @@
-"""Cut models at joins that matches contradict, merge models of one group, and find loose joins."""
+"""Cut models at joins that matches contradict, and find loose joins."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sfm_app.colmap.backend import Reconstruction, all_points, translate_errors
-from sfm_app.colmap.bundle import adjust_or_keep
-from sfm_app.colmap.joined_model import merge_models
-from sfm_app.colmap.model import points_by_keypoint, posed_images, posed_photo_ids, submodel
-from sfm_app.geometry.poses import robust_similarity
-from sfm_app.mapping.attempt import MAPPING, Attempt, NoModel, PairSupport, judge_model
-from sfm_app.numerical import FAILURES
+from sfm_app.colmap.model import posed_images, posed_photo_ids, submodel
+from sfm_app.mapping.attempt import MAPPING, Attempt, PairSupport
 from sfm_app.posegraph.rotations import DisjointGroups
 from sfm_app.runtime.context import RunContext
-from sfm_app.types import Evidence, MatchGraph, PairId, ViewGraph
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types import PairId
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -30,12 +24,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SplitOptions:
-    """When models are cut or merged, and when a scale is loose."""
+    """When models are cut, and when a scale is loose."""
 
     min_matches: int = 16
     """Least matches with which a pair can join two parts. Chosen by hand."""
-    min_shared: int = 8
-    """Least shared points for a merge: three determine a similarity. Chosen by hand."""
     min_common_points: int = 5
     """Points of two placed photos and the next one, below which the scale between them is undetermined. Measured."""
 
@@ -89,66 +81,6 @@ def _part(attempt: Attempt, photos: Sequence[int]) -> Attempt:
     members = set(photos)
     explained = {pair: pair_support for pair, pair_support in attempt.explained.items() if members.issuperset(pair)}
     return replace(attempt, model=submodel(attempt.model, photos), explained=explained)
-
-
-# Merges. Mapping ends where the next photo shares too little with the photos before it. Two models that grew from
-# either end may still share triangulated points. Three of them determine the similarity between the models; the
-# others, and the pairs between the models, verify it.
-
-
-def merge_into_main(models: tuple[Attempt, ...], evidence: Evidence, run: RunContext) -> tuple[Attempt, ...]:
-    """Join to the main model, the first, all others that fit; the rest stay unchanged. No two hold one photo."""
-    main, others = models[0], list(models[1:])
-    waiting = list(others)
-    while waiting:
-        other = waiting.pop(0)
-        together = _merge_pair(main, other, evidence, run)
-        if together is not None:
-            main = together
-            others.remove(other)
-            waiting = list(others)
-    return (main, *others)
-
-
-def _merge_pair(first: Attempt, second: Attempt, evidence: Evidence, run: RunContext) -> Attempt | None:
-    shared = shared_points(first.model, second.model, evidence.matches, evidence.views)
-    if len(shared) < OPTIONS.min_shared:
-        return None
-    try:
-        similarity = robust_similarity(shared[:, 3:], shared[:, :3])
-    except FAILURES:  # on a line
-        return None
-    database: Path = run.workspace.database
-    with translate_errors("joining two models"):
-        model = merge_models(database, first.model, second.model, similarity)
-    model = adjust_or_keep(model, database).model
-    how = f"{first.photos} and {second.photos} photos joined by {len(shared)} points"
-    attempt = judge_model(evidence, first.mapper, how, model, run)
-    if (
-        isinstance(attempt, NoModel)
-        or attempt.photos < first.photos + second.photos
-        or attempt.support <= first.support + second.support
-    ):
-        return None
-    is_whole = len(sound_parts(attempt.explained, posed_photo_ids(attempt.model))) == 1
-    return replace(attempt, note=how) if is_whole else None
-
-
-def shared_points(first: Reconstruction, second: Reconstruction, matches: MatchGraph, views: ViewGraph) -> FloatArray:
-    """Return (N, 6) points that both models hold, in the frame of the first and of the second; each only once."""
-    here, there = points_by_keypoint(first), points_by_keypoint(second)
-    photos_here, photos_there = ({photo for photo, _ in keypoints} for keypoints in (here, there))
-    points = {}
-    for pair, fit in views.fits.items():
-        a, b = pair if pair[0] in photos_here else pair[::-1]
-        if a not in photos_here or b not in photos_there:
-            continue
-        for row in matches.matches[pair][fit.inliers]:
-            row_of = dict(zip(pair, map(int, row), strict=True))
-            one, other = here.get((a, row_of[a])), there.get((b, row_of[b]))
-            if one is not None and other is not None:
-                points[one[0]] = np.concatenate([one[1], other[1]])
-    return np.array([points[key] for key in sorted(points)]).reshape(-1, 6)
 
 
 # Loose scales. The relative scale of a third photo comes from points that all three see. Where a part shares hardly any
