@@ -5,7 +5,7 @@ threshold and a looser ratio test give more there. For all photos they would cos
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -82,17 +82,6 @@ def _drop_repeats(rows: Rows) -> Rows:
 FOLDER, FEATURES = "finer", "features"
 
 
-@dataclass(frozen=True, slots=True)
-class Steps:
-    """Steps of the search; tests pass others."""
-
-    fill_database: Callable[..., object] = fill_database
-    find_evidence: Callable[[MatchGraph, RunContext, Evidence], Evidence] = find_evidence
-
-
-STEPS = Steps()
-
-
 def lost_photos(best: Outcome, run: RunContext) -> list[int]:
     """Return the photos missing in the main model; none where their share is small, or features are the finest."""
     if run.settings.matching.features == SIFT_DSP:
@@ -118,7 +107,7 @@ def candidate_pairs(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
     return sorted(pairs)
 
 
-def find_finer_evidence(best: Outcome, run: RunContext, steps: Steps = STEPS) -> tuple[Evidence, RunContext] | None:
+def find_finer_evidence(best: Outcome, run: RunContext) -> tuple[Evidence, RunContext] | None:
     """Find finer features in lost photos and their likely neighbors, then geometry and cameras.
 
     Return the evidence, and a run in a folder of its own, where a killed run is resumed; None without new geometry.
@@ -136,11 +125,11 @@ def find_finer_evidence(best: Outcome, run: RunContext, steps: Steps = STEPS) ->
     with translate_errors("extracting finer features"):
         if not finer.workspace.database.exists():
             write_match_graph(finer.workspace.database, replace(first.matches, keypoints={}, matches={}))
-    steps.fill_database(run.plugins.feature_method(SIFT_DSP), finer, pairs)
+    fill_database(run.plugins.feature_method(SIFT_DSP), finer, pairs)
     with translate_errors("adding matches"):
         matches, enriched = add_matches(first.matches, *read_features(finer.workspace.database))
     if not enriched:
         return None
-    evidence = steps.find_evidence(matches, run, first)
+    evidence = find_evidence(matches, run, first)
     # none such as of a photo of something else
     return (evidence, run) if any(pair in evidence.views.fits for pair in enriched) else None

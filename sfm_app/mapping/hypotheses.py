@@ -24,7 +24,7 @@ from sfm_app.mapping.attempt import (
     explained_pairs,
     support,
 )
-from sfm_app.mapping.feature_retry import STEPS, Steps, find_finer_evidence, lost_photos
+from sfm_app.mapping.feature_retry import find_finer_evidence, lost_photos
 from sfm_app.mapping.look_alikes import OVERLAPS, with_false_joins
 from sfm_app.mapping.passes import FIRST, MAPPERS, Mapper, Mappers, Outcome, Trial, guess_again, guessed_intrinsics
 from sfm_app.mapping.splits import split_attempt
@@ -352,8 +352,8 @@ def _lost_reason(best: Outcome, mapper: Mapper) -> str:
     return "" if lost == 0 else "1 photo is unregistered" if lost == 1 else f"{lost} photos are unregistered"
 
 
-def _with_finer_features(best: Outcome, mapper: Mapper, steps: Steps = STEPS) -> Iterator[Outcome]:
-    finer = find_finer_evidence(best, mapper.run, steps)
+def _with_finer_features(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
+    finer = find_finer_evidence(best, mapper.run)
     if finer is not None:
         yield reconstruct(*finer, mapper.mappers, FIRST_LOOK)
 

@@ -1,7 +1,6 @@
 """Finer features for unregistered photos; features and models are those of a test, databases and geometry are real."""
 
 from dataclasses import replace
-from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,10 +13,10 @@ from sfm_app.colmap.database import write_keypoints, write_matches
 from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import BackendError, ClusterError
 from sfm_app.estimation import calibrating
+from sfm_app.mapping import feature_retry
 from sfm_app.mapping.attempt import Attempt, explained_pairs
 from sfm_app.mapping.feature_retry import (
     OPTIONS,
-    Steps,
     add_matches,
     candidate_pairs,
     find_finer_evidence,
@@ -49,7 +48,7 @@ def first(synthetic, cameras, mapped, tmp_path):
 
 
 @pytest.fixture
-def finer(synthetic, mapped):
+def finer(synthetic, mapped, monkeypatch):
     """Lets finer features be those that COLMAP has made; what is asked for is noted. `places` of six find a place.
 
     Matches are wrong where their second features come in another `order`.
@@ -73,27 +72,23 @@ def finer(synthetic, mapped):
             map_group=lambda group, _: [attempt_of(synthetic, group.evidence, places)],
             judge_places=lambda _: ([], 0),
         )
-        return asked, Steps(fill_database)
+        monkeypatch.setattr(feature_retry, "fill_database", fill_database)
+        return asked
 
     return make
 
 
 @pytest.fixture
 def retry(mapped):
-    """Tries finer features, from these steps, after an outcome."""
-    finer_features = hypothesis("finer-features")
-
-    def make(best, steps):
-        return mapped.improve(best, replace(finer_features, outcomes=partial(finer_features.outcomes, steps=steps)))
-
-    return make
+    """Tries finer features after an outcome."""
+    return lambda best: mapped.improve(best, hypothesis("finer-features"))
 
 
 @pytest.mark.slow
 def test_a_lost_photo_finds_its_place_by_finer_features(first, finer, retry):
-    asked, steps = finer()
+    asked = finer()
 
-    found = retry(first, steps)
+    found = retry(first)
 
     assert asked == [("sift-dsp", [(k, LOST) for k in range(1, LOST)], OPTIONS.max_ratio)]
     assert posed_photo_ids(found.main.model) == [1, 2, 3, 4, 5, 6]
@@ -108,8 +103,8 @@ def test_a_lost_photo_finds_its_place_by_finer_features(first, finer, retry):
 
 @pytest.mark.slow
 def test_finer_features_add_matches_and_geometry(first, finer):
-    _, steps = finer()
-    evidence, run = find_finer_evidence(first, first.run, steps)
+    finer()
+    evidence, run = find_finer_evidence(first, first.run)
     assert evidence.intrinsics is first.calibrated and run.workspace.root != first.run.workspace.root
     views, rows = evidence.views, evidence.matches.matches
     assert all((k, LOST) in views.fits and len(rows[k, LOST]) >= 100 for k in range(1, LOST))
@@ -118,10 +113,11 @@ def test_finer_features_add_matches_and_geometry(first, finer):
 
 @pytest.mark.slow
 def test_cameras_that_were_not_known_are_found_anew(first, finer, cameras, monkeypatch):
-    (_, steps), anew = finer(), cameras(focal=1200.0)
+    anew = cameras(focal=1200.0)
+    finer()
     monkeypatch.setattr(calibrating, "find_intrinsics", lambda *_: anew)
     guessed = replace(first, calibrated=cameras(method="guess", identifiable=False))
-    assert find_finer_evidence(guessed, first.run, steps)[0].intrinsics is anew
+    assert find_finer_evidence(guessed, first.run)[0].intrinsics is anew
 
 
 def is_unchanged(found, first):
@@ -132,46 +128,46 @@ def is_unchanged(found, first):
 
 @pytest.mark.slow
 def test_what_was_found_first_stays_where_no_more_photos_find_a_place(first, finer, retry):
-    _, steps = finer(places=5)
-    found = retry(first, steps)
+    finer(places=5)
+    found = retry(first)
     assert is_unchanged(found, first) and found.trials[-1].photos == (5, 5)
 
 
 @pytest.mark.slow
 def test_nothing_is_mapped_again_where_no_lost_photo_shows_the_same_scene(first, finer, retry):
-    asked, steps = finer(order=slice(None, None, -1))
-    found = retry(first, steps)
+    asked = finer(order=slice(None, None, -1))
+    found = retry(first)
     assert is_unchanged(found, first) and len(asked) == 1
     assert (found.trials[-1].notes, found.trials[-1].failure) == ((), "")
 
 
 @pytest.mark.slow
 def test_finer_features_that_fail_cost_nothing(first, finer, retry):
-    _, steps = finer(failing=BackendError("the disk is full"))
-    found = retry(first, steps)
+    finer(failing=BackendError("the disk is full"))
+    found = retry(first)
     assert is_unchanged(found, first) and found.trials[-1].failure == "the disk is full"
 
 
 @pytest.mark.slow
 def test_finer_features_whose_cluster_is_gone_are_not_skipped(first, finer, retry):
-    _, steps = finer(failing=ClusterError("the scheduler is gone"))
+    finer(failing=ClusterError("the scheduler is gone"))
     with pytest.raises(ClusterError, match="scheduler"):
-        retry(first, steps)
+        retry(first)
 
 
 @pytest.mark.slow
 def test_no_finer_features_where_all_photos_have_a_place(first, finer, retry, synthetic):
-    asked, steps = finer()
+    asked = finer()
     whole = replace(first, models=(attempt_of(synthetic, first.evidence, 6),))
-    assert retry(whole, steps) is whole and asked == []
+    assert retry(whole) is whole and asked == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("chosen", [{"scene": {"without": ["finer-features"]}}, {"matching": {"features": "sift-dsp"}}])
 def test_no_finer_features_where_they_are_not_wanted(first, finer, retry, chosen):
-    asked, steps = finer()
+    asked = finer()
     unasked = replace(first, run=replace(first.run, settings=Settings.from_mapping(chosen)))
-    assert retry(unasked, steps) is unasked and asked == []
+    assert retry(unasked) is unasked and asked == []
 
 
 def photos(count, matches=()):
