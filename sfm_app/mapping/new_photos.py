@@ -5,8 +5,8 @@ keep the errors that the new photos could correct.
 """
 
 import logging
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 from sfm_app.colmap.backend import Reconstruction, translate_errors
 from sfm_app.colmap.database import write_calibrations, write_match_graph
@@ -37,13 +37,13 @@ from sfm_app.mapping.hypotheses import (
     reconstruct,
     with_doubtful_joins,
 )
-from sfm_app.mapping.look_alikes import joined_pairs, judge_places
+from sfm_app.mapping.look_alikes import joined_pairs
 from sfm_app.mapping.passes import MAPPERS, Mapper, Outcome, write_graph
 from sfm_app.mapping.splits import split_attempt
 from sfm_app.matching.pairs import find_same_matches
 from sfm_app.posegraph import build_pose_graph
 from sfm_app.runtime.context import Earlier, RunContext
-from sfm_app.types import Evidence, Intrinsics, LookAlikes, MatchGraph, PoseGraph, ViewGraph
+from sfm_app.types import Evidence, Intrinsics, MatchGraph, PoseGraph, ViewGraph
 
 logger = logging.getLogger("sfm_app")
 
@@ -56,38 +56,24 @@ def find_cameras(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intr
     return find_intrinsics(matches, views, replace(run, statistics={}))
 
 
-@dataclass(frozen=True, slots=True)
-class Steps:
-    """Steps of mapping; tests pass others."""
-
-    find_cameras: Callable[[MatchGraph, ViewGraph, RunContext], Intrinsics] = find_cameras
-    reconstruct: Callable[..., Outcome] = reconstruct
-    build_pose_graph: Callable[..., PoseGraph] = build_pose_graph
-    doubt: Callable[[Attempt, int, Evidence], str] = doubt
-    judge_places: Callable[[Sequence[Attempt]], tuple[list[LookAlikes], int]] = judge_places
-
-
-STEPS = Steps()
-
-
-def map_new_photos(evidence: Evidence, run: RunContext, earlier: Earlier, steps: Steps = STEPS) -> Outcome:
+def map_new_photos(evidence: Evidence, run: RunContext, earlier: Earlier) -> Outcome:
     """Return the earlier model with the new photos, or new models of all photos where these explain more."""
-    grown, doubt = _grow(evidence, run, earlier, steps)
-    run.record(grown_from=0 if grown is None else len(earlier.known), mapped_again_because=doubt)
+    grown, reason = _grow(evidence, run, earlier)
+    run.record(grown_from=0 if grown is None else len(earlier.known), mapped_again_because=reason)
 
     def map_anew(hypotheses: Sequence[Hypothesis]) -> Outcome:
-        cameras = steps.find_cameras(evidence.matches, evidence.views, run)
-        return steps.reconstruct(replace(evidence, intrinsics=cameras), run, hypotheses=hypotheses)
+        cameras = find_cameras(evidence.matches, evidence.views, run)
+        return reconstruct(replace(evidence, intrinsics=cameras), run, hypotheses=hypotheses)
 
     if grown is None:
-        run.progress.say(f"mapping all photos again (reason: {doubt})")
+        run.progress.say(f"mapping all photos again (reason: {reason})")
         return map_anew(ALL)
-    anew = Hypothesis("mapped-anew", lambda *_: doubt, lambda *_: iter([map_anew(FIRST_LOOK)]))
-    mapper = Mapper(run, replace(MAPPERS, judge_places=steps.judge_places))
+    anew = Hypothesis("mapped-anew", lambda *_: reason, lambda *_: iter([map_anew(FIRST_LOOK)]))
+    mapper = Mapper(run, MAPPERS)
     return with_doubtful_joins(improve(grown, mapper, [anew, FINER_FEATURES]), mapper)
 
 
-def _grow(evidence: Evidence, run: RunContext, earlier: Earlier, steps: Steps) -> tuple[Outcome | None, str]:
+def _grow(evidence: Evidence, run: RunContext, earlier: Earlier) -> tuple[Outcome | None, str]:
     """Return the earlier model with the new photos, if there is one, and why it is unreliable, if so."""
     matches = evidence.matches
     known_photos = find_same_matches(matches, earlier).photos
@@ -101,7 +87,7 @@ def _grow(evidence: Evidence, run: RunContext, earlier: Earlier, steps: Steps) -
         return None, f"the earlier model holds only {len(placed)} of {len(matches.images)} photos"
     epipolar = run.settings.epipolar
     known = model_poses(start, matches, epipolar.max_error_px, epipolar.min_inliers)
-    graph = steps.build_pose_graph(evidence, Mapper(run).pose_options, run.map, known)
+    graph = build_pose_graph(evidence, Mapper(run).pose_options, run.map, known)
     write_graph(graph, evidence, run)
     trusted = evidence.without(joined_pairs(graph.look_alikes))
     connected = max(graph.groups, key=lambda photos: len(set(photos).intersection(placed)), default=())
@@ -119,12 +105,10 @@ def _grow(evidence: Evidence, run: RunContext, earlier: Earlier, steps: Steps) -
     others = _map_others(graph, {*now, *connected}, trusted, run)
     reason = f"{how}, and {len(unplaced & now)} of {len(unplaced)} others were registered"
     outcome = Outcome((attempt, *others), graph, evidence, evidence.intrinsics, run, (attempt.note,), reason)
-    return outcome, _doubt(attempt, placed, before, trusted, run, steps)
+    return outcome, _doubt(attempt, placed, before, trusted, run)
 
 
-def _doubt(
-    attempt: Attempt, placed: Collection[int], before: float, evidence: Evidence, run: RunContext, steps: Steps
-) -> str:
+def _doubt(attempt: Attempt, placed: Collection[int], before: float, evidence: Evidence, run: RunContext) -> str:
     """Return why a model grown from photos `placed`, with the support `before`, is unreliable; empty if it is not."""
     parts = split_attempt(attempt, run)
     if len(parts) != 1 or parts[0].photos != attempt.photos:
@@ -133,9 +117,9 @@ def _doubt(
     after = support({pair: one for pair, one in attempt.explained.items() if inside.issuperset(pair)})
     if after < (1.0 - MAPPING.equal_tolerance) * before:
         return "the model explains fewer matches of the known photos than the earlier one"
-    if steps.judge_places((attempt,))[0]:
+    if MAPPERS.judge_places((attempt,))[0]:
         return "two different places are merged in the model"
-    return steps.doubt(attempt, len(photos_with_geometry(evidence)), evidence)
+    return doubt(attempt, len(photos_with_geometry(evidence)), evidence)
 
 
 def _place(start: Reconstruction, group: Group, run: RunContext) -> Reconstruction | None:

@@ -8,9 +8,10 @@ import pytest
 
 from sfm_app.colmap.database import write_match_graph
 from sfm_app.colmap.model import posed_photo_ids, submodel
+from sfm_app.mapping import new_photos
 from sfm_app.mapping.attempt import Attempt, explained_pairs, model_poses
-from sfm_app.mapping.new_photos import Steps, map_new_photos
-from sfm_app.mapping.passes import Outcome, Trial
+from sfm_app.mapping.new_photos import map_new_photos
+from sfm_app.mapping.passes import Mappers, Outcome, Trial
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.types import LookAlikes, RelativePose
 from tests.unit.mapping.fakes import EMPTY, trials_of
@@ -19,10 +20,10 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def grow(synthetic, cameras, run, tmp_path):
+def grow(synthetic, cameras, run, tmp_path, monkeypatch):
     """Maps with an earlier model of some photos; the whole set would be mapped as the given model."""
 
-    def make(model, known, whole=None, **steps):
+    def make(model, known, whole=None, judge_places=None, **steps):
         place = SimpleNamespace(database=tmp_path / "earlier.db", sparse=tmp_path / "earlier")
         place.sparse.mkdir()
         (tmp_path / "photos").mkdir()  # COLMAP requires it
@@ -42,8 +43,11 @@ def grow(synthetic, cameras, run, tmp_path):
             return Outcome(models, EMPTY, evidence, evidence.intrinsics, run, trials=(trial,))
 
         earlier = SimpleNamespace(place=place, known=names)
-        fakes = Steps(lambda *_: found, reconstruct, **steps)
-        return map_new_photos(synthetic.evidence(found), context, earlier, fakes), figures
+        if judge_places:
+            steps["MAPPERS"] = Mappers(judge_places=judge_places)
+        for name, fake in {"find_cameras": lambda *_: found, "reconstruct": reconstruct, **steps}.items():
+            monkeypatch.setattr(new_photos, name, fake)
+        return map_new_photos(synthetic.evidence(found), context, earlier), figures
 
     return make
 
