@@ -8,7 +8,7 @@ import zlib  # before pycolmap, whose own deflate symbols otherwise break every 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import pycolmap as pycolmap
@@ -33,14 +33,6 @@ _Level = pycolmap.logging.Level
 pycolmap.logging.minloglevel = _Level.FATAL.value
 
 LEVELS = tuple(level.value for level in (_Level.FATAL, _Level.WARNING, _Level.INFO))
-
-
-class Cancellation(Protocol):
-    """Token that tells a mapper to stop: COLMAP's, or one of ours."""
-
-    @property
-    def is_cancelled(self) -> bool:
-        """Whether to stop."""
 
 
 # The stubs of pycolmap 4.2 do not type the elements of COLMAP's maps.

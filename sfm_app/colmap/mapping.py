@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from sfm_app.colmap import tasks
-from sfm_app.colmap.backend import Cancellation, all_cameras, check_written, largest_model, pycolmap
+from sfm_app.colmap.backend import CancellationToken, all_cameras, check_written, largest_model, pycolmap
 from sfm_app.colmap.database import SQUARE_PIXELS
 from sfm_app.colmap.worker_process import start_worker
 
@@ -51,7 +51,7 @@ def copy_database(database: Path, scratch: Path) -> None:
 
 
 def map_globally(
-    photo_dir: Path, names: Sequence[str], scratch: Path, seed: int, token: Cancellation
+    photo_dir: Path, names: Sequence[str], scratch: Path, seed: int, token: CancellationToken
 ) -> pycolmap.Reconstruction | None:
     """Find the poses of all these photos at once (GLOMAP: rotations, positions, adjustment); None if it gave no model.
 
@@ -62,7 +62,7 @@ def map_globally(
 
 
 def map_with_colmap_defaults(
-    photo_dir: Path, scratch: Path, seed: int, token: Cancellation
+    photo_dir: Path, scratch: Path, seed: int, token: CancellationToken
 ) -> pycolmap.Reconstruction | None:
     """Verify the raw matches and map the photos by COLMAP's defaults, with the cameras of the database as first guess.
 
@@ -73,7 +73,7 @@ def map_with_colmap_defaults(
 
 
 def _map_in_process(
-    call: Callable[[], None], scratch: Path, doing: str, token: Cancellation
+    call: Callable[[], None], scratch: Path, doing: str, token: CancellationToken
 ) -> pycolmap.Reconstruction | None:
     try:
         with start_worker(call) as process:

@@ -26,6 +26,8 @@ from sfm_app.types.camera import PERSPECTIVE
 logger = logging.getLogger("sfm_app")
 
 INCREMENTAL_FOLDER, GLOBAL_FOLDER = "incremental", "global"
+COMPLETED = "missing photos added one by one"
+"""Note of a model that another mapper began."""
 NOT_NEEDED = "all at once: not needed"
 """Note of a global mapper that was stopped."""
 
@@ -334,18 +336,12 @@ def map_group(
             results.append(mapper.from_seed(seed))
         best = best_attempt(results)
         if best is not None and best.mapper == "global" and best.photos < photos:
-            results.append(mapper.complete(best))
+            results.append(mapper.judge("incremental", COMPLETED, mapper.extend(best.model)))
     return results
 
 
-def complete_attempt(group: Group, attempt: Attempt, run: RunContext) -> MappingResult:
-    """Continue a model photo by photo, with the missing photos of its group."""
-    with translate_errors("mapping photos"):
-        return _GroupMapper(group, run, COLMAP).complete(attempt)
-
-
 def extend_model(group: Group, start: Reconstruction, run: RunContext) -> Reconstruction | None:
-    """Return a model with the missing photos of its group, as `complete_attempt` does, without a verdict."""
+    """Continue a model photo by photo, with the missing photos of its group."""
     with translate_errors("mapping photos"):
         return _GroupMapper(group, run, COLMAP).extend(start)
 
@@ -365,7 +361,7 @@ class _GroupMapper:
             return NoModel("global", f"all at once: failed, {err}")
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
-        return self._judge("global", "all at once", model)
+        return self.judge("global", "all at once", model)
 
     def from_seed(self, seed: Candidate) -> MappingResult:
         evidence = self.group.evidence
@@ -376,10 +372,7 @@ class _GroupMapper:
         except FAILURES as err:
             return NoModel("incremental", f"{how}: no points, {error_reason(err)}")
         start = self.colmap.model_from_seed(self.run.workspace.database, seed.pair, rows, points)
-        return self._judge("incremental", how, self.extend(start))
-
-    def complete(self, best: Attempt) -> MappingResult:
-        return self._judge("incremental", "missing photos added one by one", self.extend(best.model))
+        return self.judge("incremental", how, self.extend(start))
 
     def extend(self, start: Reconstruction) -> Reconstruction | None:
         return self._map(partial(self._grow, start))
@@ -401,7 +394,7 @@ class _GroupMapper:
             place.database, place.photos, start, scratch, options, run.progress.advance, token
         )
 
-    def _judge(self, mapper: str, how: str, model: Reconstruction | None) -> MappingResult:
+    def judge(self, mapper: str, how: str, model: Reconstruction | None) -> MappingResult:
         return judge_model(self.group.evidence, mapper, how, model, self.run, self.colmap.explained_pairs)
 
 

@@ -11,13 +11,14 @@ from sfm_app.colmap.backend import run_in_daemon_thread, translate_errors
 from sfm_app.colmap.joined_model import adjust_joined, read_placed, write_placed
 from sfm_app.errors import BackendError
 from sfm_app.mapping.attempt import (
+    COMPLETED,
     Attempt,
     Group,
     MappingResult,
     NoModel,
     are_many_unregistered,
     best_attempt,
-    complete_attempt,
+    extend_model,
     is_focal_accurate,
     judge_model,
 )
@@ -107,7 +108,8 @@ def map_in_parts(
         return [NoModel(MAPPER, f"in {len(parts)} parts: failed, {error_reason(err)}")], ()
     best = best_attempt(attempts)
     if best is not None and best.photos < photos:
-        attempts.append(replace(complete_attempt(group, best, run), mapper=MAPPER))
+        completed = extend_model(group, best.model, run)
+        attempts.append(judge_model(group.evidence, MAPPER, COMPLETED, completed, run))
     run.record(parts=[*run.statistics.get("parts", []), part_figures(group, joined, attempts)])
     shutil.rmtree(run.workspace.root / FOLDER, ignore_errors=True)
     return attempts, ()
