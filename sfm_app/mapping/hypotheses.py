@@ -5,7 +5,7 @@ features. The loop keeps an outcome that explains more.
 """
 
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain, count
 
@@ -30,7 +30,7 @@ from sfm_app.mapping.passes import FIRST, MAPPERS, Mapper, Mappers, Outcome, Tri
 from sfm_app.mapping.splits import split_attempt
 from sfm_app.runtime.context import RunContext
 from sfm_app.settings import HYPOTHESES, HypothesisName
-from sfm_app.types import Calibration, Evidence, Intrinsics
+from sfm_app.types import Evidence, Intrinsics
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,15 +286,11 @@ def _camera_per_photo(best: Outcome) -> Intrinsics | None:
     for name in divided:
         camera = cameras.pop(name)
         focal_px, reason = focal_of.get(name, camera.focal_px), "its photos may each be of another camera"
-        names = _free_names(name, {*shared.cameras, *cameras})
+        taken = {*shared.cameras, *cameras}
+        names = chain([name], (other for number in count(2) if (other := f"{name} #{number}") not in taken))
         for photo_name, own in zip(sorted(members[name]), names, strict=False):
             cameras[own], camera_of[photo_name] = guess_again(camera, focal_px, reason), own
     return replace(shared, cameras=cameras, camera_of=camera_of)
-
-
-def _free_names(name: str, taken: Collection[str]) -> Iterable[str]:
-    """Return the name itself, then numbered variants of it that are not taken."""
-    return chain([name], (other for number in count(2) if (other := f"{name} #{number}") not in taken))
 
 
 # The cameras of the model, which correct the relative poses.
@@ -309,8 +305,10 @@ def _learning_reason(best: Outcome, _: Mapper) -> str:
         return ""
     learned = learned_intrinsics(best).cameras
     before = evidence.intrinsics.cameras
-    if any(_has_new_focal(before[name], learned[name]) for name in set(map(evidence.camera_name, placed))):
-        return "mapping has changed a focal length"
+    for name in set(map(evidence.camera_name, placed)):
+        change = abs(float(np.log(learned[name].focal_px / before[name].focal_px)))
+        if not before[name].is_estimated or change > OPTIONS.focal_tolerance:
+            return "mapping has changed a focal length"
     anywhere = {photo for model in best.models for photo in posed_photo_ids(model.model)}
     group = set(best.graph.connected_photos(placed[0]))
     lost = len(group - anywhere)
@@ -338,10 +336,6 @@ def learned_intrinsics(best: Outcome) -> Intrinsics:
         lens = earlier if earlier.has_more_terms else replace(earlier, distortion=distortion)
         cameras[name] = replace(lens, K=K, identifiable=True, reason="", method="mapping")
     return replace(intrinsics, cameras=cameras)
-
-
-def _has_new_focal(before: Calibration, after: Calibration) -> bool:
-    return not before.is_estimated or abs(float(np.log(after.focal_px / before.focal_px))) > OPTIONS.focal_tolerance
 
 
 # Finer features, for photos that are unregistered.
