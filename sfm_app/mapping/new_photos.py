@@ -37,8 +37,7 @@ from sfm_app.mapping.hypotheses import (
     reconstruct,
     with_doubtful_joins,
 )
-from sfm_app.mapping.look_alikes import joined_pairs
-from sfm_app.mapping.passes import MAPPERS, Mapper, Outcome, write_graph
+from sfm_app.mapping.passes import MAPPERS, Mapper, Outcome
 from sfm_app.mapping.splits import split_attempt
 from sfm_app.matching.pairs import find_same_matches
 from sfm_app.posegraph import build_pose_graph
@@ -87,9 +86,11 @@ def _grow(evidence: Evidence, run: RunContext, earlier: Earlier) -> tuple[Outcom
         return None, f"the earlier model holds only {len(placed)} of {len(matches.images)} photos"
     epipolar = run.settings.epipolar
     known = model_poses(start, matches, epipolar.max_error_px, epipolar.min_inliers)
-    graph = build_pose_graph(evidence, Mapper(run).pose_options, run.map, known)
-    write_graph(graph, evidence, run)
-    trusted = evidence.without(joined_pairs(graph.look_alikes))
+    mapper = Mapper(run)
+    graph = build_pose_graph(evidence, mapper.pose_options, run.map, known)
+    outcome = Outcome((), graph, evidence, evidence.intrinsics, run)
+    mapper.write(outcome)
+    trusted = outcome.trusted
     connected = max(graph.groups, key=lambda photos: len(set(photos).intersection(placed)), default=())
     unconnected = set(placed).difference(connected)
     if unconnected:  # COLMAP does not take photos without a pair in the database
@@ -104,7 +105,7 @@ def _grow(evidence: Evidence, run: RunContext, earlier: Earlier) -> tuple[Outcom
     now, unplaced = set(posed_photo_ids(attempt.model)), set(connected).difference(placed)
     others = _map_others(graph, {*now, *connected}, trusted, run)
     reason = f"{how}, and {len(unplaced & now)} of {len(unplaced)} others were registered"
-    outcome = Outcome((attempt, *others), graph, evidence, evidence.intrinsics, run, (attempt.note,), reason)
+    outcome = replace(outcome, models=(attempt, *others), notes=(attempt.note,), reason=reason)
     return outcome, _doubt(attempt, placed, before, trusted, run)
 
 

@@ -252,12 +252,8 @@ class Mapper:
         return graph
 
     def write(self, outcome: Outcome) -> None:
-        """Write the cameras and relative poses of an outcome into the database."""
-        write_graph(outcome.graph, outcome.evidence, outcome.run)
-
-
-def write_graph(graph: PoseGraph, evidence: Evidence, run: RunContext) -> None:
-    """Write cameras and relative poses into the database of a run."""
-    with translate_errors("writing relative poses"):
-        write_calibrations(run.workspace.database, evidence.matches, evidence.intrinsics)
-        write_pose_graph(run.workspace.database, evidence.matches, pairs_to_map(graph))
+        """Write the cameras and relative poses of an outcome into the database of its run."""
+        database, matches = outcome.run.workspace.database, outcome.evidence.matches
+        with translate_errors("writing relative poses"):
+            write_calibrations(database, matches, outcome.evidence.intrinsics)
+            write_pose_graph(database, matches, pairs_to_map(outcome.graph))
