@@ -12,7 +12,7 @@ from benchmarks.common.photo_sets import PhotoSet, TrueCamera
 from benchmarks.selfcal import view_graph_calibration as rival
 from sfm_app.api import open_run
 from sfm_app.camera.models import camera_matrix
-from sfm_app.estimation.calibrating import camera_pairs
+from sfm_app.estimation.calibrating import photo_pairs
 from sfm_app.pipeline import INTRINSICS, MATCH_GRAPH, VIEW_GRAPH, run_stages
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings, merge_nested
@@ -93,7 +93,8 @@ def run_calibrator(subject: MatchedSet, method: str) -> MethodResult:
     cameras: dict[str, Calibration] = {}
     seconds, pairs = 0.0, 0
     for images in subject.groups:
-        of_camera = camera_pairs(images, subject.matches, subject.views)
+        ids = [image.id for image in images]
+        of_camera = photo_pairs(images, subject.matches, subject.views).to_camera_pairs(ids)
         if method == WITHOUT_MATCHES:
             of_camera = replace(of_camera, inliers=())
         start = time.perf_counter()

@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.common.results import Row
 from benchmarks.selfcal.coverage import estimate_pairs
 from benchmarks.selfcal.methods import PRODUCTION, WITHOUT_MATCHES, MatchedSet
-from sfm_app.estimation.calibrating import camera_pairs
+from sfm_app.estimation.calibrating import photo_pairs
 from sfm_app.plugins import load_plugins
 from sfm_app.selfcal.pairs import prepare
 from sfm_app.selfcal.thesis.zero_curves import algorithm_4
@@ -35,7 +35,11 @@ def measure_speed(subject: MatchedSet | None, overrides: Mapping[str, Mapping[st
         for method in (PRODUCTION, WITHOUT_MATCHES):
             title = f"{method}{', ' if label else ''}{label}"
             if subject is not None:
-                pairs = _method_inputs(camera_pairs(subject.groups[0], subject.matches, subject.views), method)
+                images = subject.groups[0]
+                own = photo_pairs(images, subject.matches, subject.views).to_camera_pairs(
+                    [image.id for image in images]
+                )
+                pairs = _method_inputs(own, method)
                 seconds = _cpu_seconds(partial(_calibrate, pairs, settings))
                 rows.append(_row(f"{title}: {subject.photos.name}", len(pairs.Fs), seconds))
                 rows[-1]["matching seconds"] = subject.matching_seconds

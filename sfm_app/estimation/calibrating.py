@@ -29,7 +29,6 @@ from sfm_app.runtime.context import Earlier, RunContext
 from sfm_app.selfcal import CalibratedCamera, calibrate_photo_set, pair_weights
 from sfm_app.types import (
     Calibration,
-    CameraPairs,
     EpipolarFit,
     EpipolarGeometry,
     Evidence,
@@ -229,13 +228,6 @@ def photo_pairs(
         focal_hints_px={image.id: image.exif_focal_px * shown_share(image) for image in images if image.exif_focal_px},
         padded_sizes={image.id: (image.width, image.height) for image in images if image.shown},
     ).with_origins({image.id: image.shown[:2] for image in images if image.shown})
-
-
-def camera_pairs(
-    images: list[MatchedImage], matches: MatchGraph, views: ViewGraph, kind: type[EpipolarGeometry] = EpipolarFit
-) -> CameraPairs:
-    """Return `photo_pairs` as the input of a calibrator for the photos of one camera."""
-    return photo_pairs(images, matches, views, kind).to_camera_pairs([image.id for image in images])
 
 
 # Cameras of an earlier run, which its last adjustment has refined.

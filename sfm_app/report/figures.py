@@ -14,7 +14,7 @@ import numpy as np
 
 from sfm_app.camera.bearings import bearings, corner_angle, radius_deviation_px, radius_px
 from sfm_app.errors import ConfigError
-from sfm_app.estimation.calibrating import camera_pairs
+from sfm_app.estimation.calibrating import photo_pairs
 from sfm_app.geometry.epipolar import FIRST, SECOND, fit_rays, gradients, signed_distances
 from sfm_app.report.text import camera_texts
 from sfm_app.selfcal.calibrate_pairs import undistort_pairs
@@ -344,7 +344,8 @@ def draw_intrinsics(path: Path, matches: MatchGraph, views: ViewGraph, intrinsic
     for name, camera in intrinsics.cameras.items():
         if own := [image for image in images if intrinsics.camera_name(image) == name]:
             kind = EpipolarFit if camera.projection == PERSPECTIVE else RayFit
-            panels.append(Panel(name, camera, camera_pairs(own, matches, views, kind)))
+            pairs = photo_pairs(own, matches, views, kind).to_camera_pairs([image.id for image in own])
+            panels.append(Panel(name, camera, pairs))
     draw_calibration(path, sorted(panels, key=lambda panel: -len(panel.pairs.Fs)))
 
 
@@ -361,18 +362,14 @@ def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
         parts = figure.subfigures(len(drawn), 1, squeeze=False, height_ratios=heights)[:, 0]
         for part, panel in zip(parts, drawn, strict=True):
             many = f"Camera {panel.name}, one of {len(panels)}.\n" if len(panels) > 1 else ""
-            text, count, most = calibration_text(panel.camera), len(panel.pairs.Fs), OPTIONS.most_pairs
+            text = "\n".join(fill(line, 150) for line in camera_texts(panel.camera)).replace("+-", "±")
+            count, most = len(panel.pairs.Fs), OPTIONS.most_pairs
             if count > most:
                 text += f"\nThe figure shows the {most} pairs of most weight, of {count}."
             part.suptitle(many + text, fontsize=10.5, x=0.02, ha="left")
             _draw_camera(part, panel)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=130, metadata=SUFFIXES[path.suffix.lower()])
-
-
-def calibration_text(camera: Calibration) -> str:
-    """Return a calibration in words, one line per property."""
-    return "\n".join(fill(text, 150) for text in camera_texts(camera)).replace("+-", "±")
 
 
 def weightiest(pairs: CameraPairs, most: int) -> CameraPairs:

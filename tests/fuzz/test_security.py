@@ -24,9 +24,15 @@ CODE_OR_NETWORK = {
 }  # fmt: skip
 UNPICKLES_WHAT_IT_SENT = Path(sfm_app.__file__).parent / "runtime/cluster.py"
 """Checks hashes that come with the messages of a cluster."""
+CALLS_ITS_OWN_PROCESS = Path(sfm_app.__file__).parent / "colmap/worker_process.py"
+"""Sends calls to a process that it started, through a pipe, and takes their results."""
 SERVES_THIS_MACHINE = Path(sfm_app.__file__).parent / "report/server.py"
 """Listens on 127.0.0.1 only."""
-KNOWN = {UNPICKLES_WHAT_IT_SENT: ["imports pickle"], SERVES_THIS_MACHINE: ["imports http", "imports http.server"]}
+KNOWN = {
+    UNPICKLES_WHAT_IT_SENT: ["imports pickle"],
+    CALLS_ITS_OWN_PROCESS: ["imports pickle"],
+    SERVES_THIS_MACHINE: ["imports http", "imports http.server"],
+}
 RUNS_TEXT = {"eval", "exec", "compile", "__import__", "breakpoint", "os.system", "os.popen", "os.startfile"}
 
 

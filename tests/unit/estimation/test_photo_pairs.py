@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.estimation.calibrating import camera_pairs, photo_pairs, to_whole_photo
+from sfm_app.estimation.calibrating import photo_pairs, to_whole_photo
 from sfm_app.selfcal import CalibratedCamera, pair_weights
 from sfm_app.selfcal.pairs import guess_calibration
 from sfm_app.types import EpipolarFit, MatchedImage, MatchGraph, Rejected, ViewGraph
@@ -49,7 +49,7 @@ def test_pairs_that_show_a_camera_are_all_there():
 
 
 def test_a_camera_gets_its_own():
-    own = camera_pairs([IMAGES[7], IMAGES[2]], MATCHES, VIEWS)
+    own = photo_pairs([IMAGES[7], IMAGES[2]], MATCHES, VIEWS).to_camera_pairs([7, 2])
     assert (own.photos, own.size, own.focal_hints_px) == (((2, 7),), (1000, 750), (900.0,))
     assert own.Fs.shape == (1, 3, 3)
     assert len(own.inliers) == 1
@@ -57,7 +57,7 @@ def test_a_camera_gets_its_own():
 
 @pytest.mark.parametrize("chosen", [[3], [3, 9]])
 def test_without_pairs_the_arrays_are_empty_and_the_claims_remain(chosen):
-    own = camera_pairs([IMAGES[key] for key in chosen], MATCHES, VIEWS)
+    own = photo_pairs([IMAGES[key] for key in chosen], MATCHES, VIEWS).to_camera_pairs(chosen)
     assert (own.Fs.shape, own.weights.shape, own.photos, own.inliers) == ((0, 3, 3), (0,), (), ())
     assert own.size == (640, 480)
     assert own.focal_hints_px == ((600.0,) if 9 in chosen else ())
