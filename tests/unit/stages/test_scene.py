@@ -227,7 +227,7 @@ def files(folder):
 def test_models_are_written_as_a_whole_and_nothing_of_an_earlier_run_is_left(synthetic, run):
     place = run.workspace
     parts = [submodel(synthetic[1], photos) for photos in ((1, 2, 3, 4), (5, 6), (7, 8))]
-    for folder in (place.sparse, place.other_models / "7", place.root / ".sparse"):
+    for folder in (place.sparse, place.other_models / "7", place.root / ".sparse.unfinished"):
         folder.mkdir(parents=True)
         (folder / "old.bin").write_bytes(b"old")
 
