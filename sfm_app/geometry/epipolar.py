@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfm_app.errors import NumericalError
-from sfm_app.geometry.poses import normalize
 from sfm_app.types.arrays import FloatArray
 
 
@@ -371,7 +370,7 @@ def pixels_per_radian(lines: FloatArray) -> float:
 
 def rotation_residuals(lines: FloatArray, R: FloatArray) -> FloatArray:
     """Return residuals (N,), in px of view 2, of the rotation near R that explains most matches (robust Kabsch)."""
-    h1, h2 = (normalize(lines[:, view]) for view in (FIRST, SECOND))
+    h1, h2 = (h / np.linalg.norm(h, axis=1, keepdims=True) for h in (lines[:, FIRST], lines[:, SECOND]))
     focal = pixels_per_radian(lines.reshape(-1, 9))
     for _ in range(10):
         distances = focal * np.linalg.norm(h1 @ R.T - h2, axis=1)
