@@ -95,15 +95,19 @@ def divide_photos(
 def _choose(
     labels: IndexArray, hypotheses: Iterable[tuple[IndexArray, float]], grids: "set[FocalGrid]", fold: IndexArray
 ) -> tuple[IndexArray, bool]:
-    """Return the most probable cameras (N,), and whether more are possible; a hypothesis has its log-prior odds."""
+    """Return the most probable cameras (N,), and whether more are possible; a hypothesis has its log-prior odds.
+
+    A focal of its own absorbs other errors of a photo, which its pairs share. Their gains count for two pairs a photo.
+    """
     is_doubtful, doubt = False, float(np.log(1.0 - CONSENSUS.sure))
     for more, log_prior in hypotheses:
+        independent = min(1.0, 2.0 * len(more) / max(len(fold), 1)) if np.ptp(more) == len(more) - 1 else 1.0
         before, after = (max(grid.fit(one) for grid in grids) for one in (labels, more))
         # a gain that is missing on the fitted pairs will not appear on those held out
-        if after - before + log_prior <= doubt or np.array_equal(more, labels):
+        if independent * (after - before) + log_prior <= doubt or np.array_equal(more, labels):
             continue
         before, after = (max(grid.held_out(one, fold) for grid in grids) for one in (labels, more))
-        log_odds = after - before + log_prior
+        log_odds = independent * (after - before) + log_prior
         is_doubtful = log_odds <= 0.0 and (is_doubtful or log_odds > doubt)
         labels = more if log_odds > 0.0 else labels
     return labels, is_doubtful
