@@ -191,7 +191,7 @@ def _take_given_cameras(
 def explain_failure(camera: CalibratedCamera, views: ViewGraph) -> Calibration:
     """Return the calibration; if it failed because most pairs are degenerate, its reason names the degeneracy."""
     kinds = inliers_by_degeneracy(views, camera.photos)
-    if camera.found.identifiable or not kinds.total() > kinds[""]:
+    if camera.found.identifiable or kinds[""] >= kinds.total() / 2:
         return camera.found
     return replace(camera.found, reason=f"{camera.found.reason}; {diagnose_fits(views, camera.photos).message}")
 

@@ -21,6 +21,7 @@ from sfm_app.mapping.attempt import (
     NoModel,
     are_many_unregistered,
     choice_reason,
+    doubt,
     explained_pairs,
     support,
 )
@@ -199,11 +200,10 @@ def _without_false_joins(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
 def _rival_reason(best: Outcome, _: Mapper) -> str:
     if best.main is None:
         return "no photo is registered"
-    connected = len(photos_with_geometry(best.trusted))
-    if best.photos < MAPPING.enough_share * connected:
-        return f"unregistered photos with matches: {connected - best.photos}"
-    share = best.main.contradicted_share
-    return f"{100 * share:.0f} % of the matches contradict the model" if share > MAPPING.max_contradicted_share else ""
+    connected, share = len(photos_with_geometry(best.trusted)), best.main.contradicted_share
+    if best.photos >= MAPPING.enough_share * connected and share <= MAPPING.max_contradicted_share:
+        return ""  # a rival costs more than the doubt that remains is worth
+    return doubt(best.main, connected, best.trusted)
 
 
 def photos_with_geometry(evidence: Evidence) -> set[int]:

@@ -105,3 +105,13 @@ def test_the_focal_is_right_before_adjustment():
     assert found.identifiable and found.projection == "perspective"
     assert 0.0 < abs(found.focal_px / K[0, 0] - 1.0) < 0.004
     assert found.radial == pytest.approx(k1, abs=0.01)
+
+
+def test_a_reason_names_a_degeneracy_only_where_most_pairs_have_it():
+    found = Calibration(np.eye(3), 100, 80, "guess", identifiable=False, reason="an orbit")
+    camera = CalibratedCamera("one", (0, 1, 2), found)
+    mostly, hardly = row_of_photos(3, 2, {(0, 1), (1, 2)}), row_of_photos(3, 2, {(0, 1)})
+    assert module.explain_failure(camera, mostly).reason == "an orbit; everything lies in one plane (2 of 3 pairs)"
+    assert module.explain_failure(camera, hardly).reason == "an orbit"
+    known = replace(camera, found=replace(found, identifiable=True, reason=""))
+    assert module.explain_failure(known, mostly).reason == ""
