@@ -123,7 +123,7 @@ def _split_group(
     if division.is_camera_per_photo:
         return _split_by_photo(camera, number, pairs)
     if len(division.cameras) == 1:
-        doubt = "the photos may come from two cameras" if division.is_doubtful and calibration.identifiable else ""
+        doubt = "the photos may come from several cameras" if division.is_doubtful and calibration.identifiable else ""
         return [replace(camera, found=downgrade_to_estimate(calibration, doubt))]
     return _parts(camera, division.cameras, _confirmed_labels(division.labels, photos), pairs)
 
