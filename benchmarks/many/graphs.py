@@ -23,7 +23,7 @@ from benchmarks.common.processes import row_of_module
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.synthetic.matches import TownGraph, TownOptions, make_town_graph
 from sfm_app.estimation.calibrating import photo_pairs, sample_pairs
-from sfm_app.mapping.part_mapping import cut_group
+from sfm_app.mapping.cuts import cut_group
 from sfm_app.mapping.parts import OPTIONS as PARTS
 from sfm_app.plugins import load_plugins
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph

@@ -44,12 +44,6 @@ def all_cameras(model: pycolmap.Reconstruction) -> Iterable[pycolmap.Camera]:
     return cameras
 
 
-def all_images(model: pycolmap.Reconstruction) -> Iterable[pycolmap.Image]:
-    """Return all photos of a model, with and without a pose."""
-    images: Iterable[pycolmap.Image] = model.images.values()
-    return images
-
-
 def all_points(model: pycolmap.Reconstruction) -> Iterable[tuple[int, pycolmap.Point3D]]:
     """Return all points of a model with their ids."""
     points: Iterable[tuple[int, pycolmap.Point3D]] = model.points3D.items()

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap import tasks
-from sfm_app.colmap.backend import all_images, check_written, pycolmap, translate_errors
+from sfm_app.colmap.backend import check_written, pycolmap, translate_errors
+from sfm_app.colmap.model import all_images
 from sfm_app.colmap.worker_process import run_worker
 from sfm_app.files import digest_files, is_below
 from sfm_app.operating_system import replace_file

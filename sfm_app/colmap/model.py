@@ -1,6 +1,6 @@
 """COLMAP's sparse model: build, divide and move it, read it as arrays, as a scene, and as figures of its photos."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypedDict
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sfm_app.camera.models import FAMILIES, camera_matrix, projection_of_model, row_of_model
 from sfm_app.camera.projection import BEARING, RAY
 from sfm_app.camera.rows import FISHEYE, K1, PERSPECTIVE
-from sfm_app.colmap.backend import all_images, pycolmap, run_in_daemon_thread, translate_errors
+from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.geometry.epipolar import TwoViewSeed
 from sfm_app.geometry.poses import Similarity
@@ -133,6 +133,12 @@ def submodel(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.
             part.deregister_frame(image.frame_id)
     part.tear_down()  # with frames that have no pose, no covariance can be estimated
     return part
+
+
+def all_images(model: pycolmap.Reconstruction) -> Iterable[pycolmap.Image]:
+    """Return all photos of a model, with and without a pose."""
+    images: Iterable[pycolmap.Image] = model.images.values()  # the stubs of pycolmap 4.2 do not type them
+    return images
 
 
 def posed_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfm_app.errors import NumericalError
+from sfm_app.geometry.epipolar import FIRST, SECOND, depths
 from sfm_app.jit import kernel
 from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.types.arrays import FloatArray
@@ -122,6 +123,39 @@ def sampson_of_rays(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
     h1 = l0 * q[6] + l1 * q[7] + l2 * q[8]
     algebraic = q[0] * l0 + q[1] * l1 + q[2] * l2
     return float(algebraic / np.sqrt(g0 * g0 + g1 * g1 + h0 * h0 + h1 * h1 + 1e-300))
+
+
+def pose_distances(lines: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
+    """Return the Sampson distances (N,) in pixels, >= 0, of matches `lines` (N, 18) to a pose with |t| = 1."""
+    pose = np.concatenate([R.ravel(), t])
+    return np.abs(_distances(lines, pose))
+
+
+@kernel
+def _distances(lines: FloatArray, pose: FloatArray) -> FloatArray:
+    E, distances = np.empty((3, 3)), np.empty(lines.shape[0])
+    write_essential(pose, E)
+    for i in range(lines.shape[0]):
+        distances[i] = sampson_of_rays(lines[i, :9], lines[i, 9:], E)
+    return distances
+
+
+def is_in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
+    """Return a mask (N,) of the matches `used` (N, 18) whose points lie in front of both cameras."""
+    first, second = depths(used, R, t)
+    return (first > 0) & (second > 0)
+
+
+def explained_mask(lines: FloatArray, R: FloatArray, t: FloatArray, max_error_px: float) -> NDArray[np.bool_]:
+    """Return a mask (N,) of the matches (N, 18) that lie on their epipolar lines, in front of both cameras."""
+    return (pose_distances(lines, R, t) <= max_error_px) & is_in_front(lines, R, t)
+
+
+def ray_angles_deg(used: FloatArray, R: FloatArray) -> FloatArray:
+    """Return (N,) degrees between the two rays of each match (N, 18): the triangulation angles if t fits."""
+    h1, h2 = used[:, FIRST] @ R.T, used[:, SECOND]
+    sine = np.linalg.norm(np.cross(h1, h2), axis=1)
+    return np.asarray(np.degrees(np.arctan2(sine, (h1 * h2).sum(axis=1))), np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

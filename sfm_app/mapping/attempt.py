@@ -15,8 +15,8 @@ from sfm_app.colmap.mapping import copy_database, incremental_options, map_globa
 from sfm_app.colmap.model import model_from_seed, placed_views
 from sfm_app.errors import BackendError
 from sfm_app.geometry.epipolar import GOOD_ANGLE_DEG, TwoViewSeed, cross_matrix, ray_seed, two_view_seed
+from sfm_app.geometry.poses import explained_mask, ray_angles_deg
 from sfm_app.numerical import FAILURES, error_reason
-from sfm_app.posegraph.pair_pose import explained_mask, ray_angles_deg
 from sfm_app.retrieval import choose_by_rank
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Evidence, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph

@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.joined_model import PlacedPhotos
-from sfm_app.geometry.poses import Similarity, robust_similarity
+from sfm_app.geometry.poses import Similarity, explained_mask, robust_similarity
 from sfm_app.numerical import FAILURES
-from sfm_app.posegraph.pair_pose import explained_mask
 from sfm_app.posegraph.rotations import average_rotations, connected_groups, partners_of
 from sfm_app.types import MatchGraph, PairId, ViewGraph
 from sfm_app.types.arrays import FloatArray, IndexArray

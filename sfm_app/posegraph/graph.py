@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from sfm_app.geometry.epipolar import FIRST, SECOND
+from sfm_app.geometry.poses import is_in_front, pose_distances
 from sfm_app.numerical import FAILURES
 from sfm_app.posegraph.look_alikes import find_look_alikes
-from sfm_app.posegraph.pair_pose import Pair, estimate_pose, is_in_front, pose_distances, refine_pose
+from sfm_app.posegraph.pair_pose import Pair, estimate_pose, refine_pose
 from sfm_app.posegraph.rotations import average_rotations, check_loops, connected_groups
 from sfm_app.types import EpipolarGeometry, Evidence, PairId, PoseGraph, RelativePose
 from sfm_app.types.arrays import FloatArray

@@ -14,7 +14,6 @@ from sfm_app.geometry.epipolar import (
     SECOND,
     cross_matrix,
     decompose_essential,
-    depths,
     eight_point,
     fit_rays,
     gradients,
@@ -23,7 +22,16 @@ from sfm_app.geometry.epipolar import (
     rotation_residuals,
 )
 from sfm_app.geometry.least_squares import DECREASE, INCREASE, DampingRange
-from sfm_app.geometry.poses import POSE_DOF, retract, sampson_of_rays, write_essential, write_nearby_essentials
+from sfm_app.geometry.poses import (
+    POSE_DOF,
+    is_in_front,
+    pose_distances,
+    ray_angles_deg,
+    retract,
+    sampson_of_rays,
+    write_essential,
+    write_nearby_essentials,
+)
 from sfm_app.jit import kernel
 from sfm_app.types import Calibration, EpipolarFit, EpipolarGeometry, RelativePose
 from sfm_app.types.arrays import FloatArray
@@ -125,21 +133,6 @@ def refine_pose(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatA
     for sigma in OPTIONS.sigmas_px:
         pose = _descend(lines, pose, sigma, OPTIONS.steps, OPTIONS.gain)
     return pose[:9].reshape(3, 3).copy(), pose[9:].copy()
-
-
-def pose_distances(lines: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
-    """Return the Sampson distances (N,) in pixels, >= 0, of matches `lines` (N, 18) to a pose with |t| = 1."""
-    pose = np.concatenate([R.ravel(), t])
-    return np.abs(_distances(lines, pose))
-
-
-@kernel
-def _distances(lines: FloatArray, pose: FloatArray) -> FloatArray:
-    E, distances = np.empty((3, 3)), np.empty(lines.shape[0])
-    write_essential(pose, E)
-    for i in range(lines.shape[0]):
-        distances[i] = sampson_of_rays(lines[i, :9], lines[i, 9:], E)
-    return distances
 
 
 @kernel
@@ -333,24 +326,6 @@ def _is_known(pose: Pose, tried: Sequence[Pose]) -> bool:
 
 def _pose_cost(used: FloatArray, R: FloatArray, t: FloatArray) -> float:
     return float(np.sum(np.log1p((pose_distances(used, R, t) / OPTIONS.sigmas_px[-1]) ** 2)))
-
-
-def is_in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the matches `used` (N, 18) whose points lie in front of both cameras."""
-    first, second = depths(used, R, t)
-    return (first > 0) & (second > 0)
-
-
-def explained_mask(lines: FloatArray, R: FloatArray, t: FloatArray, max_error_px: float) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the matches (N, 18) that lie on their epipolar lines, in front of both cameras."""
-    return (pose_distances(lines, R, t) <= max_error_px) & is_in_front(lines, R, t)
-
-
-def ray_angles_deg(used: FloatArray, R: FloatArray) -> FloatArray:
-    """Return (N,) degrees between the two rays of each match (N, 18): the triangulation angles if t fits."""
-    h1, h2 = used[:, FIRST] @ R.T, used[:, SECOND]
-    sine = np.linalg.norm(np.cross(h1, h2), axis=1)
-    return np.asarray(np.degrees(np.arctan2(sine, (h1 * h2).sum(axis=1))), np.float64)
 
 
 def points_ahead(used: FloatArray) -> FloatArray:

@@ -1,6 +1,8 @@
-"""Mapping in parts from end to end, on a walk through a town; and what happens where parts fail."""
+"""Mapping in parts: from end to end, on a walk through a town; where parts fail; the files of a part."""
 
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +14,19 @@ from sfm_app.errors import BackendError, ClusterError
 from sfm_app.geometry.poses import umeyama
 from sfm_app.mapping import parts
 from sfm_app.mapping.attempt import Attempt, Group, NoModel, PairSupport, best_attempt
-from sfm_app.mapping.part_mapping import FOLDER, PartResult, map_part
-from sfm_app.mapping.parts import map_in_parts, part_size, parts_suffice
+from sfm_app.mapping.parts import (
+    FOLDER,
+    RESULT,
+    PartInputs,
+    PartResult,
+    map_in_parts,
+    map_part,
+    part_of_group,
+    part_size,
+    parts_suffice,
+    read_inputs,
+    write_inputs,
+)
 from sfm_app.plugins import load_plugins
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.runtime.context import RunContext
@@ -21,7 +34,8 @@ from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import SceneSettings, Settings
 from sfm_app.tasks import Task
-from sfm_app.types import Calibration, EpipolarFit, Evidence, Intrinsics, LookAlikes
+from sfm_app.types import Calibration, EpipolarFit, Evidence, Intrinsics, LookAlikes, PoseGraph, RelativePose
+from tests.unit.mapping.conftest import K
 
 PHOTOS, PART = 72, 24
 
@@ -95,7 +109,7 @@ def test_a_part_that_fails_is_left_to_the_others(start, monkeypatch):
         made.append(folder)
         return PartResult((), "", ("failed: no memory",)) if len(made) == 2 else map_part(photos, folder)
 
-    monkeypatch.setattr("sfm_app.mapping.part_mapping.map_part", some_fail)
+    monkeypatch.setattr("sfm_app.mapping.parts.map_part", some_fail)
     found, run = start(1)
 
     (figures,) = run.statistics["parts"]
@@ -195,3 +209,61 @@ def test_a_task_is_small_and_travels(tmp_path):
     task = Task(map_part, tmp_path / "photos")
     assert len(pickle.dumps((task, tmp_path))) < 1000
     assert pickle.loads(pickle.dumps(task)).args == (tmp_path / "photos",)  # noqa: S301
+
+
+def group_of(street):
+    matches, views = street.graphs()
+    poses = {
+        pair: RelativePose(np.eye(3), np.array([0.6, 0.0, 0.8]), fit.inliers, 3.25, 0.9, "planar", sum(pair) % 2 == 0)
+        for pair, fit in views.fits.items()
+    }
+    lens = Calibration(K, 1200, 900, "zero-curves", True, spread={"fx": 1.5}, key_pairs=((1, 2),))
+    other = Calibration(K, 640, 480, "guess", False)
+    intrinsics = Intrinsics({"one": lens, "two": other}, {"040.jpg": "two"})
+    return Group(tuple(matches.images), Evidence(matches, views, intrinsics), PoseGraph(poses, {}, ()))
+
+
+def test_a_part_of_a_group_has_what_concerns_its_photos(street):
+    group = group_of(street)
+    part = part_of_group(group, (3, 4, 5))
+    own = part.evidence
+    assert list(own.matches.images) == list(own.matches.keypoints) == [3, 4, 5]
+    assert list(own.matches.matches) == list(own.views.fits) == list(part.graph.poses) == [(3, 4), (3, 5), (4, 5)]
+    assert part.graph.groups == ((3, 4, 5),) and list(own.intrinsics.cameras) == ["one"]
+
+
+def test_inputs_are_read_back_as_they_were(street, tmp_path):
+    group = group_of(street)
+    part = part_of_group(group, range(21, 41))
+    settings = Settings.from_mapping({"seed": 7, "scene": {"part_photos": 33}})
+
+    write_inputs(
+        tmp_path / "a.npz", PartInputs(part, frozenset([(21, 22), (21, 23)]), settings, stop_at_false_joins=True)
+    )
+    write_inputs(
+        tmp_path / "b.npz", PartInputs(part, frozenset([(21, 23), (21, 22)]), settings, stop_at_false_joins=True)
+    )
+    again = read_inputs(tmp_path / "a.npz")
+    found, read_back, given = again.part, again.part.evidence, part.evidence
+
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert again.mapped == {(21, 22), (21, 23)} and again.settings == settings and again.stop_at_false_joins
+    assert found.photos == part.photos and read_back.matches.images == given.matches.images
+    assert list(read_back.matches.matches) == list(given.matches.matches)
+    assert all(np.array_equal(read_back.matches.matches[pair], rows) for pair, rows in given.matches.matches.items())
+    assert all(np.array_equal(read_back.matches.keypoints[photo], x) for photo, x in given.matches.keypoints.items())
+    assert all(np.array_equal(read_back.views.fits[pair].F, fit.F) for pair, fit in given.views.fits.items())
+    for pair, pose in part.graph.poses.items():
+        read = found.graph.poses[pair]
+        assert np.array_equal(read.R, pose.R) and np.array_equal(read.t, pose.t)
+        assert np.array_equal(read.inliers, pose.inliers)
+        assert (read.angle_deg, read.in_front, read.kind, read.guided) == (3.25, 0.9, "planar", sum(pair) % 2 == 0)
+    assert read_back.intrinsics.to_dict() == given.intrinsics.to_dict()
+
+
+def test_a_finished_part_is_read_with_its_false_joins(tmp_path):
+    joins = LookAlikes(((1, 2), (3, 4)), 0.875), LookAlikes(((5, 6),), 0.5)
+    result = {"models": ["model-0"], "mapper": "usual", "tried": [], "false_joins": [asdict(join) for join in joins]}
+    (tmp_path / RESULT).write_text(json.dumps(result))
+    found = map_part(Path(), tmp_path)
+    assert found.false_joins == joins and found.models == (str(tmp_path / "model-0"),)

@@ -15,16 +15,13 @@ from sfm_app.geometry.epipolar import (
     triangulate,
     triangulation_angle_deg,
 )
-from sfm_app.geometry.poses import retract
+from sfm_app.geometry.poses import is_in_front, pose_distances, ray_angles_deg, retract
 from sfm_app.posegraph.pair_pose import (
     OPTIONS,
     Pair,
     estimate_pose,
-    is_in_front,
     planar_starts,
     points_ahead,
-    pose_distances,
-    ray_angles_deg,
     refine_pose,
     turned_starts,
 )
