@@ -134,32 +134,50 @@ def best_places(own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> 
     best index of each camera by itself, which messages on loops do not always outdo. `own` (C, G) has the values of
     cameras by themselves, `between` (G, G) those of two cameras i < j.
     """
-    tables = {(i, j): table for (i, j), table in between.items()} | {(j, i): t.T for (i, j), t in between.items()}
-    messages = {edge: np.zeros(own.shape[1]) for edge in tables}
-    for _ in range(GROUPS.message_rounds):
+    ends = np.array(list(between), np.int64).reshape(-1, 2)
+    votes = np.array(list(between.values()), np.float64).reshape(-1, *own.shape[1:] * 2)
+    tables = np.array([votes, votes.transpose(0, 2, 1)])
+    starts = _pass_messages(own, ends, tables, GROUPS.message_rounds, GROUPS.damping), own
+    found = [_ascend_coordinates(np.argmax(start, axis=1), own, ends, tables) for start in starts]
+    return max(found, key=lambda places: _total_gain(places, own, between))
+
+
+@kernel
+def _pass_messages(own: FloatArray, ends: IndexArray, tables: FloatArray, rounds: int, damping: float) -> FloatArray:
+    """Return the values (C, G) of all cameras with the messages of the others.
+
+    `tables` (2, E, G, G) are the votes of the cameras `ends` (E, 2), first as they are, then transposed.
+    """
+    messages, new = np.zeros((2, len(ends), own.shape[1])), np.empty(own.shape[1])
+    for turn in range(rounds + 1):
         belief = own.copy()
-        for (_, to), message in messages.items():
-            belief[to] += message
-        for (source, to), table in tables.items():
-            new = np.max((belief[source] - messages[to, source])[:, None] + table, axis=0)
-            messages[source, to] = GROUPS.damping * messages[source, to] + (1.0 - GROUPS.damping) * (new - np.max(new))
-    belief = own.copy()
-    for (_, to), message in messages.items():
-        belief[to] += message
-    ends = [_ascend_coordinates(np.argmax(start, axis=1), own, tables) for start in (belief, own)]
-    return max(ends, key=lambda places: _total_gain(places, own, between))
+        for side in range(2):
+            for edge in range(len(ends)):
+                belief[ends[edge, 1 - side]] += messages[side, edge]
+        if turn == rounds:
+            break
+        for side in range(2):
+            for edge in range(len(ends)):
+                value = belief[ends[edge, side]] - messages[1 - side, edge]
+                new[:] = -np.inf
+                for k in range(len(new)):
+                    for j in range(len(new)):
+                        vote = value[k] + tables[side, edge, k, j]
+                        new[j] = vote if vote > new[j] else new[j]
+                messages[side, edge] = damping * messages[side, edge] + (1.0 - damping) * (new - np.max(new))
+    return belief
 
 
-def _ascend_coordinates(places: IndexArray, own: FloatArray, tables: dict[tuple[int, int], FloatArray]) -> IndexArray:
+def _ascend_coordinates(places: IndexArray, own: FloatArray, ends: IndexArray, tables: FloatArray) -> IndexArray:
     """Give every camera in turn its best index, with the others fixed, until none changes."""
     places = places.astype(np.int64)
     for _ in range(GROUPS.message_rounds):
         before = places.copy()
         for camera in range(len(places)):
             value = own[camera].copy()
-            for (source, to), table in tables.items():
-                if to == camera:
-                    value += table[places[source]]
+            for side in range(2):
+                for edge in np.flatnonzero(ends[:, 1 - side] == camera):
+                    value += tables[side, edge, places[ends[edge, side]]]
             places[camera] = int(np.argmax(value))
         if np.array_equal(places, before):
             break
