@@ -28,10 +28,6 @@ class Progress:
         """Finish the work started last."""
 
 
-class SilentProgress(Progress):
-    """A display that shows nothing."""
-
-
 class Step(NamedTuple):
     """Progress of a run, for a callback."""
 
@@ -48,7 +44,7 @@ class Step(NamedTuple):
 Callback = Callable[[Step], None]
 
 
-class CallbackProgress(SilentProgress):
+class CallbackProgress(Progress):
     """A display that calls a function with every step, in the thread of the run.
 
     An exception from the function ends the run, which can be resumed.
@@ -82,7 +78,7 @@ class CallbackProgress(SilentProgress):
 def as_progress(display: Progress | Callback | None) -> Progress:
     """Return a display for a display, a callback, or None (silence)."""
     if display is None:
-        return SilentProgress()
+        return Progress()
     return CallbackProgress(display) if callable(display) else display
 
 

@@ -27,7 +27,7 @@ from sfm_app.colmap.bundle import Adjustment, adjust
 from sfm_app.colmap.model import posed_images
 from sfm_app.colmap.readout import measure_readout, read_keypoints, straighten_model
 from sfm_app.mapping.rolling_shutter import OPTIONS, Readout, follow_shutter
-from sfm_app.progress import SilentProgress
+from sfm_app.progress import Progress
 from sfm_app.types import MatchedImage, MatchGraph
 
 ABOUT = (
@@ -69,7 +69,7 @@ def measure(name: str, kind: Kind, readout_ms: float, seed: int) -> Row:
         ignored = adjust(model, database)
         matches = timed_matches(ignored.model, sequence.times_s)
         start = time.perf_counter()
-        followed, found = follow_shutter(ignored, matches, database, SilentProgress())
+        followed, found = follow_shutter(ignored, matches, database, Progress())
         seconds = time.perf_counter() - start
         known = follow_known(ignored, matches, 1e-3 * readout_ms, database)
     if not isinstance(found, Readout):

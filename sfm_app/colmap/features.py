@@ -27,7 +27,7 @@ from sfm_app.colmap.worker_process import ProcessGroup, ProgressReporter, SiftOp
 from sfm_app.files import replace_atomically
 from sfm_app.photos.decode import read_picture, upright_image
 from sfm_app.photos.masks import read_mask
-from sfm_app.progress import Progress, SilentProgress, track
+from sfm_app.progress import Progress, track
 from sfm_app.settings import MatchSettings
 from sfm_app.types import PairId
 
@@ -316,7 +316,7 @@ def _write_snapshot(database: Path, target: Path, without: Sequence[str]) -> Non
 def find_in_chunk(inputs: SiftInputs, names: Sequence[str]) -> Part:
     """Find features of some photos, and leave their rows in a file."""
     with translate_errors("finding features"), _scratch_copy(inputs) as database:
-        find_sift(database, inputs.settings, names, 1, SilentProgress())
+        find_sift(database, inputs.settings, names, 1, Progress())
         return Part(_leave_rows(database, FEATURES, inputs.folder), len(names))
 
 
@@ -325,7 +325,7 @@ def match_chunk(inputs: SiftInputs, pairs: Sequence[PairId], progress: Progress 
     photos = sorted({photo for pair in pairs for photo in pair})
     with translate_errors("matching photos"), _MATCHING, _scratch_copy(inputs) as database:
         _copy_rows(database, inputs.folder / WITH_FEATURES, FEATURES, photos)
-        match_sift(database, inputs.settings.options, pairs, progress or SilentProgress())
+        match_sift(database, inputs.settings.options, pairs, progress or Progress())
         return Part(_leave_rows(database, MATCHES, inputs.folder), len(pairs))
 
 

@@ -20,7 +20,7 @@ from sfm_app.colmap.backend import log_level, show_log
 from sfm_app.errors import BackendError
 from sfm_app.numerical import Json
 from sfm_app.operating_system import crash_name, end_at_exit, has_run_out, ignore_interrupts, watch_parent
-from sfm_app.progress import Progress, SilentProgress
+from sfm_app.progress import Progress
 
 REPORT_FD = 3
 """File descriptor for messages of a worker process to its parent: lines of JSON."""
@@ -126,7 +126,7 @@ class ProcessGroup:
 
 def run_worker(call: Callable[[], Result], doing: str, progress: Progress | None = None) -> Result:
     """Make a call in a process of its own, and return its result, as `ProcessGroup.run` does."""
-    return ProcessGroup().run(call, doing, progress or SilentProgress())
+    return ProcessGroup().run(call, doing, progress or Progress())
 
 
 def serve(level: int, parent: int) -> None:
@@ -150,7 +150,7 @@ def report(**message: Json) -> None:
     os.write(REPORT_FD, f"{json.dumps(message)}\n".encode())
 
 
-class ProgressReporter(SilentProgress):
+class ProgressReporter(Progress):
     """Sends progress to the parent process; only the parent has stages."""
 
     def start(self, label: str, total: int) -> None:

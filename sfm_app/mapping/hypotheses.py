@@ -201,7 +201,9 @@ def _rival_reason(best: Outcome, _: Mapper) -> str:
     if best.main is None:
         return "no photo is registered"
     connected, share = len(photos_with_geometry(best.trusted)), best.main.contradicted_share
-    if best.photos >= MAPPING.enough_share * connected and share <= MAPPING.max_contradicted_share:
+    # with known cameras, what moves contradicts a model, and a rival with guessed ones follows that
+    known = all(best.evidence.camera(photo).identifiable for photo in best.evidence.matches.images)
+    if best.photos >= MAPPING.enough_share * connected and (known or share <= MAPPING.max_contradicted_share):
         return ""  # a rival costs more than the doubt that remains is worth
     return doubt(best.main, connected, best.trusted)
 

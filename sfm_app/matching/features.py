@@ -37,7 +37,7 @@ from sfm_app.files import load_arrays, mark_unfinished, replace_atomically, resu
 from sfm_app.photos.masks import read_mask
 from sfm_app.photos.panoramas import PanoramaViews, shrink
 from sfm_app.plugins import FeatureMethod
-from sfm_app.progress import Progress, SilentProgress, track
+from sfm_app.progress import Progress, track
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.settings import MatchSettings
@@ -252,7 +252,7 @@ def match_in_chunks(sift: Mapping[str, SiftOption], pairs: Sequence[PairId] | No
         group.stop()
 
 
-class _PairCounter(SilentProgress):
+class _PairCounter(Progress):
     def __init__(self, progress: Progress) -> None:
         self._progress, self._lock = progress, Lock()
 

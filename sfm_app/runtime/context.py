@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from sfm_app.files import save_files
 from sfm_app.operating_system import machine_memory_mb
 from sfm_app.plugins import Plugins
-from sfm_app.progress import Progress, SilentProgress, track
+from sfm_app.progress import Progress, track
 from sfm_app.runtime.cost_estimate import SHARE_OF_MACHINE
 from sfm_app.runtime.parallel import make_executor, ordered_map, threads_elsewhere
 from sfm_app.runtime.workspace import Workspace
@@ -73,7 +73,7 @@ class RunContext:
     plugins: Plugins
     executor: Executor
     workers: int
-    progress: Progress = field(default_factory=SilentProgress)
+    progress: Progress = field(default_factory=Progress)
     fingerprint: str = ""
     given: GivenCameras = field(default_factory=GivenCameras)
     """Cameras from the user's calibration file."""

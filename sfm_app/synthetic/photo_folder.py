@@ -16,7 +16,7 @@ from PIL import Image
 from sfm_app.errors import InputError
 from sfm_app.files import replace_atomically
 from sfm_app.formats.meshes import triangles
-from sfm_app.progress import Progress, SilentProgress, track
+from sfm_app.progress import Progress, track
 from sfm_app.synthetic.cameras import Camera, Lens, Views, camera_center, check_ranges
 from sfm_app.synthetic.render import GAMMA, prepare, render_scene
 from sfm_app.synthetic.shapes import SyntheticScene
@@ -98,7 +98,7 @@ def write_photo_folder(
         folder.mkdir(parents=True, exist_ok=True)
         if missing:
             done = _render(missing, processes, folder, scene, views, options or PhotoOptions())
-            for _ in track(progress or SilentProgress(), done, "rendering photos", len(missing)):
+            for _ in track(progress or Progress(), done, "rendering photos", len(missing)):
                 pass
     except OSError as err:
         raise InputError(f"cannot write photos to {folder}: {err}", hint="choose another folder") from err

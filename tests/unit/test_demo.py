@@ -15,7 +15,7 @@ from sfm_app.cli.commands import SCENES as TEXTS
 from sfm_app.cli.output import fold_lines
 from sfm_app.demo import SCENES, DemoScene, demo_lines, draw, evaluate, render_photos
 from sfm_app.errors import InputError
-from sfm_app.progress import SilentProgress
+from sfm_app.progress import Progress
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import make_camera
 from sfm_app.types import CameraModel, Model, Scene, Surface, Texture
@@ -30,7 +30,7 @@ def small(sweep_deg=40.0, photos=3):
 SMALL_SCENES = {"one": small(), "turned": small(60.0), "longer": small(40.0, 4)}
 
 
-class Stopping(SilentProgress):
+class Stopping(Progress):
     """Stops as a person does, before the first photo."""
 
     def start(self, *_):
@@ -38,7 +38,7 @@ class Stopping(SilentProgress):
 
 
 def render(out, scene, progress=None):
-    return render_photos(out, scene, ONE_WORKER, progress or SilentProgress(), SMALL_SCENES)
+    return render_photos(out, scene, ONE_WORKER, progress or Progress(), SMALL_SCENES)
 
 
 def changes(out):

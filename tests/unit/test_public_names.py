@@ -9,7 +9,7 @@ import pytest
 
 import sfm_app
 from sfm_app.errors import ConfigError
-from sfm_app.progress import CallbackProgress, SilentProgress, Step, as_progress, track
+from sfm_app.progress import CallbackProgress, Progress, Step, as_progress, track
 from sfm_app.settings import QUALITY_PRESETS, Settings
 
 
@@ -80,7 +80,7 @@ def test_an_exception_of_the_function_ends_the_work():
 def test_a_display_is_taken_as_it_is_and_nothing_is_silence():
     shown = CallbackProgress(print)
     assert as_progress(shown) is shown
-    assert isinstance(as_progress(None), SilentProgress)
+    assert isinstance(as_progress(None), Progress)
 
 
 def test_toml_round_trip(tmp_path):

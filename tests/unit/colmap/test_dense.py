@@ -27,7 +27,7 @@ from sfm_app.colmap.dense import (
 from sfm_app.colmap.surface import FUSED, fuse, open_points, poisson_surface, positions, simplify
 from sfm_app.errors import BackendError
 from sfm_app.photos.masks import save_mask
-from sfm_app.progress import SilentProgress
+from sfm_app.progress import Progress
 from sfm_app.stereo import DepthEstimate, DepthMap
 from sfm_app.tasks import Shared
 from sfm_app.types import Surface
@@ -65,7 +65,7 @@ def workspace(tmp_path_factory):
             track.add_element(image_id, index)
         model.add_point3D(xyz, track, np.zeros(3, np.uint8))
     model.write(place / "sparse")
-    undistort(place / "sparse", place / "photos", place / "dense", 1000, 1, SilentProgress())
+    undistort(place / "sparse", place / "photos", place / "dense", 1000, 1, Progress())
     views = read_views(place / "dense")
     for view in views:
         y, x = np.mgrid[: view.height, : view.width] + view.sample_px
@@ -221,7 +221,7 @@ def test_points_in_one_spot_give_a_surface_without_triangles(tmp_path):
 
 def test_missing_inputs_are_backend_errors(tmp_path, workspace):
     with pytest.raises(BackendError, match="undistorting photos"):
-        undistort(tmp_path / "none", tmp_path, tmp_path / "dense", 100, 1, SilentProgress())
+        undistort(tmp_path / "none", tmp_path, tmp_path / "dense", 100, 1, Progress())
     with pytest.raises(BackendError, match=r"depth map of 1\.png"):
         read_depth(tmp_path, workspace[1][0], "geometric")
 
@@ -261,7 +261,7 @@ def place(tmp_path_factory):
 @pytest.fixture
 def dense(place, tmp_path):
     root, _ = place
-    undistort(root / "sparse", root / "photos", tmp_path, 120, 1, SilentProgress())
+    undistort(root / "sparse", root / "photos", tmp_path, 120, 1, Progress())
     views = read_views(tmp_path)
     cameras = pickle.loads(pickle.dumps(cameras_of_photos(root / "sparse")))  # noqa: S301 - as for another process
     for view in views:
@@ -290,7 +290,7 @@ def test_masks_are_undistorted_as_photos_are(place, dense):
 
 def test_without_masks_all_is_used(place, tmp_path):
     root, _ = place
-    undistort(root / "sparse", root / "photos", tmp_path, 120, 1, SilentProgress())
+    undistort(root / "sparse", root / "photos", tmp_path, 120, 1, Progress())
     view = read_views(tmp_path)[0]
     depth = np.full((view.height, view.width), 3.0, np.float32)
     assert used_pixels(tmp_path, view) is None

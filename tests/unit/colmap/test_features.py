@@ -28,12 +28,12 @@ from sfm_app.colmap.features import (
 from sfm_app.colmap.worker_process import ProcessGroup
 from sfm_app.errors import BackendError
 from sfm_app.matching.features import chunks
-from sfm_app.progress import SilentProgress
+from sfm_app.progress import Progress
 from sfm_app.settings import MatchSettings
 from sfm_app.types import Photo, PhotoSet
 
 
-class Counted(SilentProgress):
+class Counted(Progress):
     def __init__(self):
         self.steps = 0
 
@@ -62,7 +62,7 @@ def made(tmp_path_factory):
     create_database(place / "empty.db", PhotoSet(place / "photos", tuple(photos), (), None))
     shutil.copyfile(place / "empty.db", place / "whole.db")
     settings = SiftSettings(place / "photos", None, OPTIONS)
-    find_sift(place / "whole.db", settings, [photo.name for photo in photos], 1, SilentProgress())
+    find_sift(place / "whole.db", settings, [photo.name for photo in photos], 1, Progress())
     matching = pycolmap.FeatureMatchingOptions()
     matching.skip_geometric_verification, matching.num_threads = True, 1
     pycolmap.match_exhaustive(place / "whole.db", matching_options=matching, device=pycolmap.Device.cpu)
@@ -114,7 +114,7 @@ def test_a_process_that_is_stopped_leaves_nothing(made, tmp_path):
     before = sorted(path.name for path in inputs.folder.iterdir())
     group.stop()
     with pytest.raises(BackendError, match="killed"):
-        match_chunk_apart(inputs, group, SilentProgress(), [(1, 2)])
+        match_chunk_apart(inputs, group, Progress(), [(1, 2)])
     assert sorted(path.name for path in inputs.folder.iterdir()) == before
 
 
@@ -162,7 +162,7 @@ def find(place, database, **options):
     photos = PhotoSet(place, tuple(Photo(name, *SIZE, "g") for name in (RICH, POOR, EMPTY)))
     if not database.exists():
         create_database(database, photos)
-    find_sift(database, SiftSettings(place, None, MatchSettings(**options)), (RICH, POOR, EMPTY), 1, SilentProgress())
+    find_sift(database, SiftSettings(place, None, MatchSettings(**options)), (RICH, POOR, EMPTY), 1, Progress())
     graph = read_match_graph(database, photos)
     return {graph.images[key].name: at for key, at in graph.keypoints.items()}
 

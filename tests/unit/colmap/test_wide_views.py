@@ -9,7 +9,7 @@ from sfm_app.colmap.dense import has_masks, read_color, read_views, undistort, u
 from sfm_app.colmap.perspective import LargerViews
 from sfm_app.colmap.wide_views import split_wide_photos, view_name, write_model, write_views
 from sfm_app.photos.masks import save_mask
-from sfm_app.progress import SilentProgress
+from sfm_app.progress import Progress
 from sfm_app.stereo import rank_neighbors
 from tests.unit.colored_photos import SIZE, colors_of, make_model, write_photos
 
@@ -124,7 +124,7 @@ def test_large_views_are_scaled_down_without_aliasing(tmp_path):
 def plain(tmp_path):
     """Photos of a lens that one view is enough for."""
     make_place(tmp_path, "plain")
-    undistort(tmp_path / "sparse", tmp_path / "photos", tmp_path / "dense", 150, 1, SilentProgress())
+    undistort(tmp_path / "sparse", tmp_path / "photos", tmp_path / "dense", 150, 1, Progress())
     return tmp_path, {view.name: view for view in read_views(tmp_path / "dense")}
 
 

@@ -18,7 +18,7 @@ from sfm_app.estimation.given_cameras import (
 )
 from sfm_app.photos.probe import split_by_given_camera
 from sfm_app.plugins import load_plugins
-from sfm_app.progress import SilentProgress
+from sfm_app.progress import Progress
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
@@ -171,7 +171,7 @@ def test_a_claim_may_be_rounded_and_photos_may_be_unsure(claimed, deviation, con
     assert FocalClaim(claimed, 3, 1850.0, deviation).is_contradicted == contradicted
 
 
-class Said(SilentProgress):
+class Said(Progress):
     """Progress that keeps what is said."""
 
     def __init__(self):

@@ -17,7 +17,7 @@ from sfm_app.colmap.joined_model import PlacedPhotos
 from sfm_app.geometry.epipolar import eight_point, fundamental_from_pose
 from sfm_app.geometry.poses import Similarity
 from sfm_app.mapping.joins import Fragment
-from sfm_app.progress import SilentProgress
+from sfm_app.progress import Progress
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, EpipolarFit, Evidence, Intrinsics, MatchedImage, MatchGraph, ViewGraph
@@ -107,7 +107,7 @@ def run(synthetic, tmp_path):
             workspace=Workspace(tmp_path),
             seed=0,
             workers=2,
-            progress=SilentProgress(),
+            progress=Progress(),
             map=lambda function, items, _: [function(item) for item in items],
         )
 

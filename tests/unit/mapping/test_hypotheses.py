@@ -243,6 +243,13 @@ def test_good_evidence_needs_no_rival(synthetic, run, cameras, mapped):
     assert asked == [] and trials_of(found) == [("first-pass", True, "6 photos")] and found.photos == 6
 
 
+def test_known_cameras_need_no_rival_where_matches_contradict_the_model(synthetic, run, cameras, mapped):
+    """What moves contradicts a model, and a rival with guessed cameras follows it."""
+    ours = Attempt("incremental", synthetic.copy(), joined(AGAINST, AGAINST), "")
+    reasons = [hypothesis(RIVAL).reason(mapped.best(one, run(), ours), None) for one in (cameras(), cameras(**GUESS))]
+    assert reasons[0] == "" and "contradict the model" in reasons[1]
+
+
 def test_a_rival_that_fails_costs_nothing(synthetic, run, cameras, mapped):
     mapped(without(with_camera(synthetic.copy(), TRUE), [6]), None)
     mapped.mappers = replace(mapped.mappers, map_rival=Mappers().map_rival)

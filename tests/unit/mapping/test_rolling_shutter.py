@@ -14,7 +14,7 @@ from sfm_app.colmap.bundle import Adjustment, adjust
 from sfm_app.colmap.model import posed_images
 from sfm_app.mapping import rolling_shutter
 from sfm_app.mapping.rolling_shutter import OPTIONS, Readout, follow_shutter, frame_times
-from sfm_app.progress import SilentProgress
+from sfm_app.progress import Progress
 from sfm_app.types import MatchedImage, MatchGraph
 
 KIND = Kind(walk=WalkOptions(swing_deg_s=60.0), frames=16, points=400)
@@ -30,7 +30,7 @@ class Video:
     truth: dict[str, np.ndarray]
 
 
-class Said(SilentProgress):
+class Said(Progress):
     """A display that keeps its messages."""
 
     def __init__(self):

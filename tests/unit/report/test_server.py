@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from sfm_app.errors import ConfigError
-from sfm_app.progress import SilentProgress
+from sfm_app.progress import Progress
 from sfm_app.report import server as serving
 from sfm_app.report.server import (
     BYTES,
@@ -208,7 +208,7 @@ def test_ctrl_c_ends_it(resources, monkeypatch):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         serve_run(
-            SimpleNamespace(progress=SilentProgress()), 0, lambda address: Thread(target=browse, args=[address]).start()
+            SimpleNamespace(progress=Progress()), 0, lambda address: Thread(target=browse, args=[address]).start()
         )
     finally:
         signal.signal(signal.SIGINT, before)

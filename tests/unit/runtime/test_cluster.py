@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from sfm_app.errors import ClusterError, ConfigError, InputError
-from sfm_app.progress import SilentProgress
+from sfm_app.progress import Progress
 from sfm_app.runtime import cluster
 from sfm_app.runtime.cluster import (
     PROCESSOR,
@@ -92,7 +92,7 @@ def tasks(place):
 def two(place, tasks):
     """The executor of a run with two workers."""
     settings = Settings.from_mapping({"cluster": {"address": "local:2"}})
-    with open_executor(settings, place / "out" / ".cluster", SilentProgress()) as (executor, workers):
+    with open_executor(settings, place / "out" / ".cluster", Progress()) as (executor, workers):
         assert (workers, threads_elsewhere(executor)) == (2, 2)
         yield executor
     assert not (place / "out" / ".cluster").exists()
@@ -166,7 +166,7 @@ def test_no_scheduler_is_one_line(tmp_path):
     settings = Settings.from_mapping({"cluster": {"address": "127.0.0.1:1", "wait_s": 0.5}})
     with (
         pytest.raises(ClusterError, match=r"no scheduler answers at 127\.0\.0\.1:1"),
-        open_executor(settings, tmp_path, SilentProgress()),
+        open_executor(settings, tmp_path, Progress()),
     ):
         pass
 

@@ -14,7 +14,7 @@ from sfm_app.files import UNFINISHED
 from sfm_app.meshing.visibility import SKY
 from sfm_app.photos.masks import save_mask
 from sfm_app.plugins import DepthMethod, hookimpl, load_plugins
-from sfm_app.progress import SilentProgress
+from sfm_app.progress import Progress
 from sfm_app.settings import DepthSettings, Settings
 from sfm_app.stages import depth_maps
 from sfm_app.stereo import DepthMap
@@ -76,7 +76,7 @@ def run_stage(scene, ways, fingerprint="", mask_dir=None, **settings):
     place = SimpleNamespace(photos=scene.photo_dir, dense=scene.dense_dir)
     run = SimpleNamespace(
         plugins=ways.plugins, record=lambda **more: counts.update(more), map=one_by_one, fingerprint=fingerprint,
-        settings=Settings(depth=options), workspace=place, workers=2, progress=SilentProgress(), mask_dir=mask_dir,
+        settings=Settings(depth=options), workspace=place, workers=2, progress=Progress(), mask_dir=mask_dir,
     )  # fmt: skip
     assert depth_maps.make(scene, run) == scene.dense_dir
     return counts
