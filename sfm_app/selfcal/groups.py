@@ -144,10 +144,7 @@ def best_places(own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> 
 
 @kernel
 def _pass_messages(own: FloatArray, ends: IndexArray, tables: FloatArray, rounds: int, damping: float) -> FloatArray:
-    """Return the values (C, G) of all cameras with the messages of the others.
-
-    `tables` (2, E, G, G) are the votes of the cameras `ends` (E, 2), first as they are, then transposed.
-    """
+    """Return values (C, G) with messages; `tables` (2, E, G, G) of the cameras `ends` (E, 2), and their transposes."""
     messages, new = np.zeros((2, len(ends), own.shape[1])), np.empty(own.shape[1])
     for turn in range(rounds + 1):
         belief = own.copy()

@@ -38,6 +38,8 @@ class DivisionOptions:
     """Most pairs that are compared: a table takes 50 kB a pair; by hand."""
     folds: int = 5
     """Parts of the pairs that are held out in turn; by hand."""
+    max_remaining_share: float = 0.5
+    """Share of the unexplained likelihood that more cameras may leave: right ones leave 0.15 to 0.37. Section 6."""
 
 
 DIVISION = DivisionOptions()
@@ -97,17 +99,19 @@ def _choose(
 ) -> tuple[IndexArray, bool]:
     """Return the most probable cameras (N,), and whether more are possible; a hypothesis has its log-prior odds.
 
-    A focal of its own absorbs other errors of a photo, which its pairs share. Their gains count for two pairs a photo.
+    A focal of its own also absorbs errors that the pairs of a photo share: more cameras must explain most of the rest.
     """
     is_doubtful, doubt = False, float(np.log(1.0 - CONSENSUS.sure))
+    most = next(iter(grids)).most
     for more, log_prior in hypotheses:
-        independent = min(1.0, 2.0 * len(more) / max(len(fold), 1)) if np.ptp(more) == len(more) - 1 else 1.0
         before, after = (max(grid.fit(one) for grid in grids) for one in (labels, more))
         # a gain that is missing on the fitted pairs will not appear on those held out
-        if independent * (after - before) + log_prior <= doubt or np.array_equal(more, labels):
+        if after - before + log_prior <= doubt or np.array_equal(more, labels):
             continue
         before, after = (max(grid.held_out(one, fold) for grid in grids) for one in (labels, more))
-        log_odds = independent * (after - before) + log_prior
+        if most - after > DIVISION.max_remaining_share * (most - before):
+            continue
+        log_odds = after - before + log_prior
         is_doubtful = log_odds <= 0.0 and (is_doubtful or log_odds > doubt)
         labels = more if log_odds > 0.0 else labels
     return labels, is_doubtful
@@ -140,6 +144,7 @@ class FocalGrid:
         shape = (len(rows), DIVISION.focals, DIVISION.focals)
         self.gains = tables.weights[rows][:, None, None] * np.log1p(np.reshape(votes, shape) / sigma)
         """(P, G, G)."""
+        self.most = float(np.sum(tables.weights[rows]) * np.log1p(1.0 / sigma))  # where all pairs fit exactly
 
     def places(self, labels: IndexArray, rows: IndexArray) -> IndexArray:
         """Return (C,) grid indices of the focals on which the pairs `rows` agree, given the camera of each photo."""
