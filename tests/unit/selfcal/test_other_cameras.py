@@ -61,6 +61,17 @@ def test_matrices_of_another_camera_do_not_divide_photos(shots):
         Fs[wrong] = other.pairs.Fs[wrong]
         assert set(divide(made, Fs).labels.values()) == {0}
 
+def test_errors_that_the_pairs_of_a_photo_share_do_not_divide_photos(shots):
+    """A moving object in a few photos gives them a focal of their own; other wrong pairs stay as they are."""
+    for seed in range(4):
+        made, rng = shots(8, 330 + seed, points=120), np.random.default_rng(seed)
+        Fs = with_wrong(made.pairs.Fs, 0.4, rng)
+        longer = MIDDLE @ np.diag([1.0, 1.0, 1.6]) @ np.linalg.inv(MIDDLE)
+        for k, pair in enumerate(made.pairs.photos):
+            if pair[0] == made.pairs.photos[0][0] and rng.random() < 0.7:
+                Fs[k] = made.pairs.Fs[k] @ longer
+        assert set(divide(made, Fs).labels.values()) == {0}
+
 
 @slow
 @pytest.mark.parametrize("motion", ["orbit", "parallel", "onward", "turning"])
