@@ -61,6 +61,7 @@ def test_matrices_of_another_camera_do_not_divide_photos(shots):
         Fs[wrong] = other.pairs.Fs[wrong]
         assert set(divide(made, Fs).labels.values()) == {0}
 
+
 def test_errors_that_the_pairs_of_a_photo_share_do_not_divide_photos(shots):
     """A moving object in a few photos gives them a focal of their own; other wrong pairs stay as they are."""
     for seed in range(4):
