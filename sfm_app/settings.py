@@ -133,6 +133,8 @@ HypothesisName = Literal[
     "finer-features", "mapped-anew", "look-alikes", "global-mapper", "splits", "lens-families",
     "rolling-shutter",
 ]  # fmt: skip
+FIRST_TRIAL = "first-pass"
+"""Name of the trial that all hypotheses are compared with."""
 HYPOTHESES: Mapping[HypothesisName, str] = {
     "false-joins": "leaving out the ambiguous pairs",
     "colmap-defaults": "COLMAP's default pipeline",

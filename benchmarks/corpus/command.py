@@ -27,7 +27,7 @@ from benchmarks.common.command_line import new_parser, overrides
 from benchmarks.common.photo_sets import FORMATS, PhotoSet, photo_set, steps
 from benchmarks.common.results import RESULTS, Row, document, finite_or_none, write
 from benchmarks.corpus.bars import required_bars, unreported_fold
-from benchmarks.corpus.kept_runs import FinishedRun, reusable_run, run_and_record, run_key, trials
+from benchmarks.corpus.kept_runs import FinishedRun, has_tried, reusable_run, run_and_record, run_key, trials
 from benchmarks.corpus.report import add_comparisons, corpus_page
 from benchmarks.corpus.score import OFFSETS, corpus_figures, fold_lines
 from sfm_app.settings import HypothesisName
@@ -126,7 +126,7 @@ def run_all(args: argparse.Namespace, these: Sequence[Method]) -> Iterator[tuple
                 photos = load_set(title, args)
                 folder = args.cache / "corpus" / photos.folder.name
                 out, finished = folder / method.name.replace(" ", "_"), folder / OURS if method.without else None
-                if finished and method.without not in {trial["name"] for trial in trials(finished)}:
+                if finished and not has_tried(finished, method.without):
                     continue
                 done = reusable_run(method, photos, out, args)
                 if done is None and args.score_only:

@@ -65,12 +65,25 @@ def run_and_record(
 
 def trials(out: Path) -> list[Row]:
     """Return the hypotheses that the run in OUT tried; none if it has no scene."""
+    listed: list[Row] = _scene_counts(out).get("hypotheses", [])
+    return listed
+
+
+def has_tried(out: Path, hypothesis: str) -> bool:
+    """Return whether the run in OUT tried a hypothesis, by itself or within another one."""
+    counts = _scene_counts(out)
+    named = {part for trial in trials(out) for part in trial["name"].split(": ")}
+    entries = {"look-alikes": "look_alikes", "lens-families": "lenses", "rolling-shutter": "shutter"}
+    return hypothesis in named or bool(counts.get(entries.get(hypothesis, "")))
+
+
+def _scene_counts(out: Path) -> Row:
     try:
         stages = json.loads((out / "manifest.json").read_text(encoding="utf-8"))["stages"]
     except (OSError, ValueError, KeyError):
-        return []
-    listed: list[Row] = stages.get("scene", {}).get("counts", {}).get("hypotheses", [])
-    return listed
+        return {}
+    counts: Row = stages.get("scene", {}).get("counts", {})
+    return counts
 
 
 def record_run(out: Path, done: FinishedRun) -> None:

@@ -30,7 +30,7 @@ from benchmarks.common.outputs import read_initial_cameras, read_refined_cameras
 from benchmarks.common.photo_sets import PhotoSet
 from benchmarks.common.processes import run_command
 from benchmarks.common.results import RESULTS, Row, document, table, write
-from benchmarks.corpus.kept_runs import FinishedRun, load_finished_run, record_run, run_key, trials
+from benchmarks.corpus.kept_runs import FinishedRun, has_tried, load_finished_run, record_run, run_key, trials
 from benchmarks.corpus.report import GAINS_TEXT, hypothesis_rows
 from benchmarks.corpus.score import Doubt, parameter_errors
 from benchmarks.synthetic.trouble import KINDS, troubled_folder, write_troubled_folder
@@ -73,7 +73,7 @@ def run_folder(seed: int, args: argparse.Namespace) -> list[Row]:
     rows = []
     for method in (Method(OURS), *ablations(args.without)):
         out = whole.with_name(f"{whole.name}-without-{method.without}") if method.without else whole
-        if method.without and method.without not in {trial["name"] for trial in trials(whole)}:
+        if method.without and not has_tried(whole, method.without):
             continue
         key = run_key(method, PhotoSet(photos.name, photos, {}))
         done = load_finished_run(out)

@@ -1,12 +1,8 @@
 """Cameras from the normal equations of a bundle: free parts, estimates, deviations, and the family of a lens.
 
-Ours; the choice by marginal likelihood is that of `geometry.least_squares`. As for pairs (`selfcal.priors`), each
-part of a camera has a narrow prior about its usual value and a wide one. A part is freed where the evidence for the
-wide prior outweighs how rare such cameras are. Freed or not, the prior stays in the estimate, so undetermined parts
-stay near their usual values. A lens that would fold inside the photo is refused.
-
-A perspective lens with strong distortion is often a fisheye. Both are adjusted to the same observations, and their
-evidence is compared (`family_evidence`).
+Ours. Parts are freed as those of pairs are (`selfcal.priors`); the prior stays in the estimate, so undetermined parts
+stay near their usual values. A lens that would fold inside the photo is refused. A perspective lens with strong
+distortion is often a fisheye: both are adjusted to the same observations, and their evidence is compared.
 """
 
 from dataclasses import dataclass, replace

@@ -2,10 +2,11 @@
 
 import logging
 import shutil
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 
@@ -255,6 +256,10 @@ class Attempt:
     explained: dict[PairId, PairSupport]
     note: str
     """How it was made, and how many photos it holds; for people."""
+    reason: str = ""
+    """Why this mapper followed another one; empty for the first."""
+    seconds: float = 0.0
+    """Time of a mapper that followed another one."""
 
     @property
     def photos(self) -> int:
@@ -275,10 +280,14 @@ class Attempt:
 
 @dataclass(frozen=True, slots=True)
 class NoModel:
-    """Why a mapper gave no model, or one with too few points."""
+    """Why a mapper gave no model, or one with too few points; the fields are those of `Attempt`."""
 
-    mapper: str
-    note: str
+    mapper: str = ""
+    note: str = ""
+    reason: str = ""
+    seconds: float = 0.0
+    photos: ClassVar[int] = 0
+    support: ClassVar[float] = 0.0
 
 
 MappingResult: TypeAlias = Attempt | NoModel
@@ -327,9 +336,10 @@ def map_group(
     with translate_errors("mapping photos"):
         results = [mapper.from_seed(seed) for seed in seeds[:1]]
         if with_global:
-            first = best_attempt(results)
-            is_enough = first is not None and (not doubt(first, photos, group.evidence) or is_sufficient(first))
-            results.append(NoModel("global", NOT_NEEDED) if is_enough else mapper.all_at_once())
+            first, reason = best_attempt(results), "no photo is registered"
+            if first is not None:
+                reason = "" if is_sufficient(first) else doubt(first, photos, group.evidence)
+            results.append(mapper.all_at_once(reason) if reason else NoModel("global", NOT_NEEDED))
         for seed in seeds[1:]:
             if _has_placed_enough(results, photos):
                 break
@@ -350,7 +360,8 @@ class _GroupMapper:
     def __init__(self, group: Group, run: RunContext, colmap: ColmapMappers) -> None:
         self.group, self.run, self.colmap = group, run, colmap
 
-    def all_at_once(self) -> MappingResult:
+    def all_at_once(self, reason: str) -> MappingResult:
+        start = time.monotonic()
         names, scratch = self.group.evidence.matches.names(self.group.photos), self.run.workspace.root / GLOBAL_FOLDER
         photos, seed = self.run.workspace.photos, self.run.seed
         self.colmap.copy_database(self.run.workspace.database, scratch)
@@ -358,10 +369,11 @@ class _GroupMapper:
             model = self._map(lambda token: self.colmap.map_globally(photos, names, scratch, seed, token))
         except BackendError as err:  # another mapper may do better
             logger.info("the global mapper failed: %s", err)
-            return NoModel("global", f"all at once: failed, {err}")
+            return NoModel("global", f"all at once: failed, {err}", reason, time.monotonic() - start)
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
-        return self.judge("global", "all at once", model)
+        result = self.judge("global", "all at once", model)
+        return replace(result, reason=reason, seconds=time.monotonic() - start)
 
     def from_seed(self, seed: Candidate) -> MappingResult:
         evidence = self.group.evidence

@@ -27,10 +27,10 @@ from sfm_app.mapping.attempt import (
 )
 from sfm_app.mapping.feature_retry import find_finer_evidence, lost_photos
 from sfm_app.mapping.look_alikes import OVERLAPS, with_false_joins
-from sfm_app.mapping.passes import FIRST, MAPPERS, Mapper, Mappers, Outcome, Trial, guess_again, guessed_intrinsics
+from sfm_app.mapping.passes import MAPPERS, Mapper, Mappers, Outcome, Trial, guess_again, guessed_intrinsics
 from sfm_app.mapping.splits import split_attempt
 from sfm_app.runtime.context import RunContext
-from sfm_app.settings import HYPOTHESES, HypothesisName
+from sfm_app.settings import FIRST_TRIAL, HYPOTHESES, HypothesisName
 from sfm_app.types import Evidence, Intrinsics
 
 
@@ -79,8 +79,10 @@ def reconstruct(
         write_match_graph(run.workspace.database, evidence.matches)
     mapper, start = Mapper(run, mappers), time.monotonic()
     first = mapper.map(evidence)
-    trial = Trial(FIRST, "", True, (0, first.photos), (0.0, first.support), time.monotonic() - start, first.notes)
-    best = improve(replace(first, trials=(trial,)), mapper, ALL if hypotheses is None else hypotheses)
+    seconds = time.monotonic() - start
+    trial = Trial.of(FIRST_TRIAL, "", (NoModel(), first), seconds, first.notes, accepted=True)
+    first = replace(first, trials=(trial, *within(FIRST_TRIAL, first)))
+    best = improve(first, mapper, ALL if hypotheses is None else hypotheses)
     return with_doubtful_joins(best, mapper)
 
 
@@ -102,9 +104,9 @@ def improve(best: Outcome, mapper: Mapper, hypotheses: Iterable[Hypothesis]) -> 
             if not reason:
                 break
             if sum(trial.seconds for trial in best.trials if trial.is_hypothesis) >= options.hypotheses_s:
-                late = _trial(hypothesis, reason, best, best, 0.0, accepted=False)
                 failure = f"no time was left, of {options.hypotheses_s:g} s"
-                best = replace(best, trials=(*best.trials, replace(late, notes=(), failure=failure)))
+                late = Trial.of(hypothesis.name, reason, (best, best), accepted=False, failure=failure)
+                best = replace(best, trials=(*best.trials, late))
                 break
             best, accepted = _try(hypothesis, reason, best, mapper)
             if not accepted:
@@ -119,23 +121,22 @@ def _try(hypothesis: Hypothesis, reason: str, best: Outcome, mapper: Mapper) -> 
     try:
         for other in hypothesis.outcomes(best, mapper):
             accepted = is_better(other, best, mapper)
-            trials += [replace(inner, name=f"{hypothesis.name}: {inner.name}") for inner in other.trials]
-            trials.append(_trial(hypothesis, reason, best, other, time.monotonic() - start, accepted=accepted))
+            trials += within(hypothesis.name, other)
+            rest = time.monotonic() - start, other.notes
+            trials.append(Trial.of(hypothesis.name, reason, (best, other), *rest, accepted=accepted))
             best, start = other if accepted else best, time.monotonic()
     except BackendError as err:  # the best outcome is not lost with it; errors of ours are not hidden
         failure = str(err)
     if failure or len(trials) == len(first.trials):
-        trial = _trial(hypothesis, reason, best, best, time.monotonic() - start, accepted=False)
-        trials.append(replace(trial, notes=(), failure=failure))
+        seconds = time.monotonic() - start
+        trials.append(Trial.of(hypothesis.name, reason, (best, best), seconds, (), failure, accepted=False))
     mapper.write(best)
     return replace(best, trials=tuple(trials)), best is not first
 
 
-def _trial(
-    hypothesis: Hypothesis, reason: str, best: Outcome, other: Outcome, seconds: float, *, accepted: bool
-) -> Trial:
-    photos = best.photos, other.photos
-    return Trial(hypothesis.name, reason, accepted, photos, (best.support, other.support), seconds, other.notes)
+def within(name: str, outcome: Outcome) -> list[Trial]:
+    """Return the trials of an outcome as parts of the trial with a name."""
+    return [replace(trial, name=f"{name}: {trial.name}") for trial in outcome.trials]
 
 
 def is_better(other: Outcome, best: Outcome, mapper: Mapper) -> bool:

@@ -5,9 +5,11 @@ matrices, cameras and poses, and so shares none of their errors.
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
+from itertools import chain
+from typing import Any, NamedTuple
 
 from sfm_app.camera.models import GUESSED_FOCAL, guessed_camera_matrix
 from sfm_app.colmap.backend import run_interruptible, translate_errors
@@ -34,15 +36,14 @@ from sfm_app.mapping.splits import split_attempt
 from sfm_app.numerical import Json
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
 from sfm_app.runtime.context import RunContext
-from sfm_app.settings import SceneSettings
+from sfm_app.settings import FIRST_TRIAL, SceneSettings
 from sfm_app.types import Calibration, Evidence, Intrinsics, LookAlikes, PoseGraph
 from sfm_app.types.camera import PERSPECTIVE
 
 logger = logging.getLogger("sfm_app")
 
 
-FIRST = "first-pass"
-"""Name of the trial that all hypotheses are compared with."""
+CONTRADICTED_JOIN = "more matches contradict a join than support it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,16 +59,26 @@ class Trial:
     """Photos of the main model before and with it."""
     support: tuple[float, float]
     """Support of the main model before and with it."""
-    seconds: float
+    seconds: float = 0.0
     notes: tuple[str, ...] = ()
     """How its models were made; for people."""
     failure: str = ""
     """Why it failed, for people; empty if it did not."""
 
+    @classmethod
+    def of(
+        cls, name: str, reason: str, both: Sequence["MappingResult | Outcome"], *rest: Any, accepted: bool, **more: Any
+    ) -> "Trial":
+        """Compare the results before and with it; the others are the fields from `seconds` on."""
+        before, after = both
+        return cls(
+            name, reason, accepted, (before.photos, after.photos), (before.support, after.support), *rest, **more
+        )
+
     @property
     def is_hypothesis(self) -> bool:
         """Whether this is neither the first pass nor a part of another trial."""
-        return self.name != FIRST and ":" not in self.name
+        return self.name != FIRST_TRIAL and ":" not in self.name
 
     def to_dict(self) -> dict[str, Json]:
         """Return JSON values."""
@@ -126,6 +137,39 @@ class Outcome:
         evidence = replace(earlier.evidence, intrinsics=self.evidence.intrinsics)
         graph = with_earlier_look_alikes(self.graph, earlier.graph)
         return replace(self, evidence=evidence, calibrated=earlier.calibrated, graph=graph)
+
+
+class MappedGroup(NamedTuple):
+    """Results of the mappers on a group, the best of them, and its parts."""
+
+    results: Sequence[MappingResult]
+    best: Attempt | None
+    parts: Sequence[Attempt]
+
+    def trials(self) -> Iterator[Trial]:
+        """Yield the hypotheses of a pass that were tried: the global mapper, and a split of the best model."""
+        for number, one in enumerate(self.results):
+            if one.reason:
+                both = best_attempt(self.results[:number]) or NoModel(), one
+                rest = one.seconds, (one.note,)
+                yield Trial.of("global-mapper", one.reason, both, *rest, accepted=one is self.best)
+        if self.best is not None and len(self.parts) > 1:
+            yield Trial.of("splits", CONTRADICTED_JOIN, (self.best, self.parts[0]), accepted=True)
+
+
+def _outcome_of(groups: Sequence[MappedGroup], start: Outcome) -> Outcome:
+    models = sorted(chain(*(group.parts for group in groups)), key=lambda one: (-one.photos, -one.support))
+    cut = [part for group in groups if len(group.parts) > 1 for part in group.parts]
+    names = start.evidence.matches.names
+    reasons = [choice_reason(best, results) for results, best, parts in groups if best and parts and models[0] in parts]
+    return replace(
+        start,
+        models=tuple(models),
+        notes=tuple(result.note for group in groups for result in group.results),
+        reason="".join(reasons),
+        cuts=tuple(", ".join(names(sorted(posed_photo_ids(part.model)))) for part in cut),
+        trials=tuple(chain(*(group.trials() for group in groups))),
+    )
 
 
 RIVAL, RIVAL_FOLDER, RIVAL_NOTE = "colmap", "rival", "COLMAP's default pipeline"
@@ -191,27 +235,16 @@ class Mapper:
         graph = build_pose_graph(evidence, self.pose_options, self.run.map)
         outcome = Outcome((), graph, evidence, evidence.intrinsics, self.run)
         self.write(outcome)
-        trusted, models = outcome.trusted, list[Attempt]()
-        reasons: dict[str, str] = {}
-        notes: list[str] = []
-        cuts: list[str] = []
+        trusted, groups = outcome.trusted, list[MappedGroup]()
         for number, photos in enumerate(graph.groups):
             if number and len(photos) < MAPPING.min_photos:
                 continue
-            attempts, joins = self._map_by_size(Group(photos, trusted, graph), stop_at_false_joins=chances > 0)
+            results, joins = self._map_by_size(Group(photos, trusted, graph), stop_at_false_joins=chances > 0)
             if joins:
                 return self._map_without(joins, outcome, chances - 1)
-            notes += [attempt.note for attempt in attempts]
-            best = best_attempt(attempts)
-            if best is not None:
-                reasons[best.note] = choice_reason(best, attempts)
-                parts = split_attempt(best, self.run)
-                models += parts
-                if len(parts) > 1:
-                    cuts += [", ".join(evidence.matches.names(sorted(posed_photo_ids(one.model)))) for one in parts]
-        models.sort(key=lambda attempt: (-attempt.photos, -attempt.support))
-        reason = reasons[models[0].note] if models else ""
-        return replace(outcome, models=tuple(models), notes=tuple(notes), reason=reason, cuts=tuple(cuts))
+            best = best_attempt(results)
+            groups.append(MappedGroup(results, best, [] if best is None else split_attempt(best, self.run)))
+        return _outcome_of(groups, outcome)
 
     def _map_without(self, joins: Sequence[LookAlikes], outcome: Outcome, chances: int) -> Outcome:
         """Map without false joins of parts; joins without which the photos fall apart are doubtful."""

@@ -1,18 +1,10 @@
-"""Detection of equal things in different places, before mapping.
+"""Detection of equal things in different places, before mapping; docs/algorithms/look-alikes.md has steps and figures.
 
-Photos of two equal cans on a table have a relative pose as good as any, and its rotation may agree with the other
-pairs. The path between the cans distinguishes them: along the pairs that share most of their content (`coverages`), the
-points of the first can leave the view, and those of the second are new ones. Therefore
-
-1. the pairs of the backbone join matches into tracks;
-2. a pair with many matches on such tracks, but hardly any with both ends on the same track, contradicts the backbone:
-   it closes a loop, or joins look-alikes;
-3. such pairs between the same two places are judged together: if they were one place, the surroundings of the things
-   would have matches, too. In a loop they have.
+A relative pose between two equal cans on a table is as good as any. The path between them, along pairs that share most
+of their content (`coverages`), distinguishes them: points of the first leave the view, and those of the second are new.
 
 Zach et al. 2010 and Heinly et al. 2014 test for missing matches; Wilson and Snavely 2013 and Yan et al. 2017 test how
-tracks and paths of photos are connected. Both are needed: a wide baseline misses many matches, and a loop loses its
-tracks.
+tracks connect photos. Both are needed: a wide baseline misses many matches, and a loop loses its tracks.
 """
 
 from collections.abc import Collection, Iterable, Mapping

@@ -7,7 +7,7 @@ from typing import Any
 from sfm_app.camera.bearings import field_of_view_deg
 from sfm_app.camera.models import calibration_from_model
 from sfm_app.frame.sighted_points import Distance
-from sfm_app.settings import HYPOTHESES
+from sfm_app.settings import FIRST_TRIAL, HYPOTHESES
 from sfm_app.types import Calibration, CameraModel, Intrinsics, Scene
 from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, GIVEN, KEPT
 from sfm_app.wording import format_length, list_names
@@ -261,12 +261,12 @@ def _mapping_lines(counts: Mapping[str, Any]) -> Iterator[str]:
     for joins in (one["dropped_joins"] for one in counts.get("parts", ()) if one["dropped_joins"]):
         yield f"rejected joins between parts, which other joins or matches contradict: {len(joins)}"
     for trial in counts.get("hypotheses", ()):
-        if trial["name"] in HYPOTHESES:
+        if (name := trial["name"].removeprefix(f"{FIRST_TRIAL}: ")) in HYPOTHESES:
             before, after = trial["photos"]
             gain = f"{after} photos instead of {before}" if after != before else "it is better"
             failed = f"it failed: {trial['failure']}" if trial["failure"] else "it is no better"
             result = gain if trial["accepted"] else failed
-            yield f"tried {HYPOTHESES[trial['name']]}, because {trial['reason']}: {result}"
+            yield f"tried {HYPOTHESES[name]}, because {trial['reason']}: {result}"
     if dropped := sum(counts.get("pairs_dropped", {}).values()):
         yield f"rejected pairs of photos that contradict the others: {dropped}"
 

@@ -1,17 +1,14 @@
 """Bundle adjustment without points: cameras and relative poses of all pairs, adjusted jointly to their matches.
 
-Ours. A pair has fifteen parameters: five of each camera (`pairs`), and five of its relative pose. The distance of a
-match is Sampson's (thesis 4.2) for rays, with E = [t]x R of thesis (5.7), in pixels of the photo as it is, so that
-undistorting does not change the weight of a pixel::
+Ours. A pair has fifteen parameters: five of each camera (`pairs`), and five of its relative pose, which is eliminated
+(Schur complement; Triggs and others 2000). The distance of a match is Sampson's (thesis 4.2) for rays, with E = [t]x R
+of thesis (5.7), in pixels of the photo as it is, so that undistorting does not change the weight of a pixel::
 
     r = C / |dC/d(x1, y1, x2, y2)|,    C = q2' E q1,    q = ray of a pixel
 
-Matches that fit badly are downweighted by the cost r^2 / (1 + r^2 / c^2) with c = 3 sigma (Geman and McClure 1987).
-
-Every pair has its own pose, which is eliminated (Schur complement; Triggs and others 2000). What remains of a pair is
-its information about the cameras: one Hessian and one gradient. A pair with right matches but wrong geometry (repeated
-facades, another camera, a zoom) pulls at the cameras far harder than its noise explains, and is downweighted, as by
-thesis (5.23) and (5.24) in Algorithm 3.
+Matches that fit badly are downweighted by the cost r^2 / (1 + r^2 / c^2) with c = 3 sigma (Geman and McClure 1987). So
+is a pair with right matches but wrong geometry (repeated facades, another camera, a zoom), which pulls at the cameras
+far harder than its noise explains, as by thesis (5.23) and (5.24) in Algorithm 3.
 """
 
 from collections.abc import Sequence

@@ -1,25 +1,19 @@
 """The constraint of one F on K, and the K that most pairs agree on, with the evidence for and against it.
 
 F has rank 2, so E = K'FK has singular values s1 >= s2 and 0, and Huang and Faugeras's constraint s1 = s2 (thesis 5.2.4,
-5.8.2) follows from two numbers without an SVD::
-
-    a = tr(EE') = s1^2 + s2^2        the sum of the squared entries of E
-    p = (s1 s2)^2                    the sum of the squared 2x2 minors of E
-
-The minors of F form the matrix q e2 e1' (unit epipoles e1, e2, and q the product of F's singular values), those of a
-product are the products of the minors, and the minors of K come from adj(K). Hence::
+5.8.2) follows from two numbers without an SVD: a = tr(EE') = s1^2 + s2^2, the sum of the squared entries of E, and
+p = (s1 s2)^2, the sum of its squared 2x2 minors. With unit epipoles e1, e2, and q the product of F's singular values::
 
     p = q^2 |adj(K) e2|^2 |adj(K) e1|^2
 
 Thesis (5.33) seeks the point where most zero curves meet, in one plane of K at a time. Here all of K is searched at
-once: at the parameters ``theta = (log f, u, v, log a)``, with f = sqrt(fx fy) and a = fy / fx, how many pairs satisfy
-the constraint? Each pair votes with at most its weight, so that outliers have little influence::
+once: at the parameters ``theta = (log f, u, v, log a)``, with f = sqrt(fx fy) and a = fy / fx, each pair votes with at
+most its weight, so that outliers have little influence::
 
     support(theta) = sum_i w_i exp(-r_i(theta) / sigma),    r = (s1 - s2) / (s1 + s2) of E_i = K'F_iK
 
-A vote is taken as a log-likelihood, to which a log-prior on the center is added: the prior decides where pairs are few
-and fades where they are many. The evidence is ours: the bootstrap is Rubin's (1981), the effective sample size Kish's
-(1965).
+A vote is taken as a log-likelihood, and a log-prior on the center is added. The evidence is ours: the bootstrap is
+Rubin's (1981), the effective sample size Kish's (1965).
 """
 
 from collections.abc import Sequence

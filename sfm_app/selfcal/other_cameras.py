@@ -1,13 +1,9 @@
 """Photos of one size: of one camera, of two, or each of its own.
 
 Ours, on the constraint of thesis 5.2.4; the thesis leaves several peaks of the consensus (Figure 5.15) undone. A pair
-of weight w with the residual r under two focals has the log-likelihood, up to a constant::
-
-    w log(1 + exp(-r / s) / s)
-
-r is exponential with mean s for a right pair and uniform on [0, 1] for a wrong one, either as likely. A hypothesis is
-fitted to four fifths of the pairs and predicts the rest: more focals fit any pairs better, but do not predict wrong
-ones. A hypothesis with more cameras is chosen if it is more probable a posteriori.
+of weight w with the residual r under two focals has the log-likelihood w log(1 + exp(-r / s) / s), up to a constant:
+r is exponential with mean s for a right pair, and uniform on [0, 1] for a wrong one. Focals are fitted to four fifths
+of the pairs and predict the rest.
 """
 
 from collections.abc import Iterable, Mapping, Sequence

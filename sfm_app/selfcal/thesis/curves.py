@@ -125,14 +125,9 @@ _NO_STEP = 1e-15
 
 
 def companion_roots(coefficients: FloatArray) -> ComplexArray:
-    """Return all roots of real polynomials as the eigenvalues of their companion matrices.
+    """Return all roots (..., n) of polynomials (..., n + 1), lowest power first: eigenvalues of companion matrices.
 
-    Args:
-        coefficients: (..., n + 1), lowest power first.
-
-    Returns:
-        (..., n) roots; a polynomial of lower degree has roots far out in place of the missing ones, one that vanishes
-        has all roots 0.
+    A polynomial of lower degree has roots far out in place of the missing ones; one that vanishes has all roots 0.
     """
     monic = _make_monic(coefficients)
     degree = coefficients.shape[-1] - 1
@@ -144,16 +139,10 @@ def companion_roots(coefficients: FloatArray) -> ComplexArray:
 
 
 def swept_roots(coefficients: FloatArray) -> ComplexArray:
-    """Return `companion_roots` of polynomials that change little from one to the next along the second axis.
+    """Return `companion_roots` (P, S, n), in any order, of polynomials that change little from one S to the next.
 
     It is far faster: Aberth's iteration (Math. Comp. 27, 1973) carries all roots of one polynomial to those of the
     next. Eigenvalues are used where it does not converge, and for multiple roots, which it finds less accurately.
-
-    Args:
-        coefficients: (P, S, n + 1), lowest power first.
-
-    Returns:
-        (P, S, n) roots; each sample's in no particular order.
     """
     vanished = np.all(coefficients == 0, axis=-1)
     first = np.argmin(vanished, axis=1)

@@ -36,16 +36,9 @@ class Meeting(NamedTuple):
 def meeting_point(curves: FloatArray, upper: float, sigma: float) -> Meeting | None:
     """Return the meeting point of thesis (5.33), with its argmin corrected to argmax.
 
-    It is the sample with the highest support by the other curves. The distance d is that of (5.34), the difference at
-    the same sample of the sweep; rho(d) = exp(-d / sigma).
-
-    Args:
-        curves: (C, S) curves that are not degenerate.
-        upper: only samples within (0, upper) can be the answer.
-        sigma: one tenth of the range of the values.
-
-    Returns:
-        None where there are fewer than two curves, or no sample within the range.
+    It is the sample within (0, upper) with the highest support by the other curves. The distance d is that of (5.34),
+    the difference at the same sample of the sweep; rho(d) = exp(-d / sigma) with sigma a tenth of the range. `curves`
+    (C, S) are not degenerate. None where there are fewer than two curves, or no sample within the range.
     """
     if len(curves) < 2:
         return None
@@ -58,16 +51,9 @@ def meeting_points(curves: FloatArray, sweep: FloatArray, limits: tuple[float, f
     """Return all well-separated peaks of the support along the sweep: the cameras in a set of several (Figure 5.15).
 
     A peak is higher than its neighbors along the sweep, `SEPARATION` away from higher peaks, and has `LEAST_SHARE` of
-    the highest one's support.
-
-    Args:
-        curves: (C, S) focal curves fy that are not degenerate.
-        sweep: (S,) fx, rising.
-        limits: only fx and fy between them are answers; near 0 all curves bunch up, so 0 is no good lower limit.
-        sigma: as in `meeting_point`, but small beside the distance between the cameras' focals.
-
-    Returns:
-        By falling support; empty where there are fewer than two curves.
+    the highest one's support. `curves` (C, S) are focal curves fy that are not degenerate, at rising fx of `sweep`
+    (S,). Only fx and fy between the limits are answers; near 0 all curves bunch up, so 0 is no good lower limit. sigma
+    is as in `meeting_point`, but small beside the distance between the cameras' focals. Peaks have falling support.
     """
     if len(curves) < 2:
         return []

@@ -122,6 +122,19 @@ def test_the_parts_of_a_cut_model_are_models_of_their_own_and_named(synthetic, r
     assert [posed_photo_ids(part.model) for part in found.models] == [[1, 2, 3], [4, 5, 6]]
     assert found.cuts == tuple(", ".join(synthetic.matches.names(part)) for part in ((1, 2, 3), (4, 5, 6)))
     assert found.support == found.models[0].support == pytest.approx(150)
+    [trial] = found.trials
+    assert (trial.name, trial.accepted, trial.photos) == ("splits", True, (6, 3))
+    assert trial.support[1] == found.support
+
+
+@pytest.mark.parametrize("lost", [[], [5, 6]])
+def test_the_global_mapper_is_a_trial_where_it_followed_another_one(synthetic, run, cameras, mapped, lost):
+    first = replace(mapped.attempt(without(synthetic.copy(), [6])), mapper="incremental")
+    own = replace(mapped.attempt(without(synthetic.copy(), lost)), reason="photo 6 is unregistered", seconds=2.5)
+    mappers = replace(mapped.mappers, map_group=lambda *_: [first, own])
+    [trial] = Mapper(run(), mappers).map(mapped.evidence(cameras())).trials
+    assert (trial.name, trial.reason, trial.seconds) == ("global-mapper", "photo 6 is unregistered", 2.5)
+    assert (trial.accepted, trial.photos) == (not lost, (5, 6 - len(lost)))
 
 
 def only(synthetic, *pairs):
