@@ -1,5 +1,6 @@
 """Matches that do not determine F: planes, lines, rotations (Hartley and Zisserman 2004, 11.9), watermarks (ours)."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -7,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.fundamental.a_contrario import MOST_FALSE_ALARMS, accidental_share, false_alarms
-from sfm_app.fundamental.pretests import PreTest
+from sfm_app.fundamental.pretests import BailOut, PreTest
 from sfm_app.fundamental.refits import factorize
 from sfm_app.fundamental.samples import RandomState, uniform
 from sfm_app.fundamental.scores import FIRST, Loss, penalty, squared_distances
@@ -30,6 +31,10 @@ class DegeneracyOptions:
     """Matches that fix the parameters of F that a line leaves free. Counted (docs/algorithms/lev-ransac.md)."""
     parallax_sample: int = 2
     """Matches that fix the parameters of F that a plane leaves free. Counted (docs/algorithms/lev-ransac.md)."""
+    parallax_trials: int = 4000
+    """Most samples of matches off a plane: two of a share of 5 % are right ten times. Chosen by hand."""
+    parallax_confidence: float = 0.9999
+    """Probability of a right sample that ends them. Chosen by hand."""
     extent_quantiles: tuple[float, float] = (0.01, 0.99)
     """Quantiles that bound the points of a view, without a few gross outliers. Chosen by hand."""
     focals: tuple[float, float, int] = (0.4, 6.0, 60)
@@ -264,35 +269,50 @@ def _translation(t: FloatArray) -> FloatArray:
 
 # Plane and parallax: the right epipole for a model of a dominant plane (after Chum, Werner and Matas 2005). Samples
 # from one large plane give its homography H but a wrong epipole. With H given, two matches off the plane are a
-# minimal sample: the lines from H x1 to x2 meet in the epipole.
+# minimal sample: the lines from H x1 to x2 meet in the epipole. Of the matches off a facade, few are right: they need
+# many samples, which cost little, as only these matches are scored.
 
 
 def recover_epipole(
-    points: FloatArray, F: FloatArray, threshold: float, loss: Loss, pretest: PreTest, state: RandomState
+    points: FloatArray, F: FloatArray, threshold: float, loss: Loss, state: RandomState
 ) -> FloatArray | None:
-    """Estimate the best model with the dominant plane of F's inliers; None without a plane and two matches off it."""
+    """Estimate the best model with the dominant plane of F's inliers; None without a plane and two matches off it.
+
+    `loss` is Geman and McClure's. Its scale decides which matches agree with an epipole: within the threshold, too many
+    agree with a wrong one.
+    """
     inliers = squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold
     if np.count_nonzero(inliers) < 8:
         return None
     chosen = np.asfortranarray(points[np.flatnonzero(inliers)[:_MOST_SCORED]])
     H = dominant_homography(chosen, F, threshold)
-    off_plane = np.flatnonzero(transfer_distance(H, points) > DEGENERACY.off * threshold)
-    if len(off_plane) < 2:
+    off_plane = np.asfortranarray(points[transfer_distance(H, points) > threshold])
+    if len(off_plane) < DEGENERACY.parallax_sample:
         return None
-    best = np.empty(9)
-    lowest = _search_epipole(points, H, off_plane, loss, pretest, state, best)
-    return best.reshape(3, 3) if np.isfinite(lowest) else None
+    loss = loss._replace(limit=1.0 / loss.precision)
+    best, lowest, trials, needed = np.zeros(9), np.full(1, np.inf), 0, DEGENERACY.parallax_trials
+    test = BailOut(len(off_plane), DEGENERACY.parallax_sample)
+    while trials < needed:
+        trials += _draw_epipoles(off_plane, H, loss, test.pretest, needed - trials, state, lowest, best)
+        share = float(np.mean(squared_distances(off_plane, best) <= loss.limit))
+        test.expect(share)
+        needed = math.ceil(min(test.required_trials(share, DEGENERACY.parallax_confidence), needed))
+    return best.reshape(3, 3) if np.isfinite(lowest[0]) else None
 
 
 @kernel
-def _search_epipole(
-    points: FloatArray, H: FloatArray, off_plane: NDArray[np.int64], loss: Loss, pretest: PreTest, state: RandomState,
-    best: FloatArray,
-) -> float:  # fmt: skip
-    lowest, line, f = np.inf, np.empty((2, 3)), np.empty(9)
-    for _ in range(100):
+def _draw_epipoles(  # noqa: PLR0913
+    points: FloatArray, H: FloatArray, loss: Loss, pretest: PreTest, limit: int, state: RandomState,
+    lowest: FloatArray, best: FloatArray,
+) -> int:  # fmt: skip
+    """Draw pairs of matches off the plane (N, 4) until an epipole e lowers `lowest` (1,); return their number.
+
+    Writes F = [e]x H to `best` (9,).
+    """
+    line, f = np.empty((2, 3)), np.empty(9)
+    for trial in range(1, limit + 1):
         for k in range(2):
-            i = off_plane[int(uniform(state) * off_plane.shape[0])]
+            i = int(uniform(state) * points.shape[0])
             hx = H[0, 0] * points[i, 0] + H[0, 1] * points[i, 1] + H[0, 2]
             hy = H[1, 0] * points[i, 0] + H[1, 1] * points[i, 1] + H[1, 2]
             hz = H[2, 0] * points[i, 0] + H[2, 1] * points[i, 1] + H[2, 2]
@@ -313,12 +333,13 @@ def _search_epipole(
             continue
         for c in range(9):
             f[c] /= np.sqrt(squared)
-        score = penalty(points, FIRST, f, loss, lowest, pretest)
-        if score < lowest:
-            lowest = score
+        score = penalty(points, FIRST, f, loss, lowest[0], pretest)
+        if score < lowest[0]:
+            lowest[0] = score
             for c in range(9):
                 best[c] = f[c]
-    return lowest
+            return trial
+    return limit
 
 
 # Watermarks: logos, time stamps, dust, or the same photo twice. Ours; the name is COLMAP's. A logo agrees with F =

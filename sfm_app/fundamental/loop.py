@@ -26,8 +26,8 @@ from sfm_app.types.arrays import FloatArray, IndexArray
 
 Refine = Callable[[FloatArray, FloatArray, float], FloatArray]
 """(points, F, threshold) -> a better F."""
-Recover = Callable[[FloatArray, FloatArray, float, Loss, PreTest, RandomState], FloatArray | None]
-"""(points, F, threshold, loss, pre-test, random generator) -> an F that the samples may have missed, or None."""
+Recover = Callable[[FloatArray, FloatArray, float, Loss, RandomState], FloatArray | None]
+"""(points, F, threshold, loss, random generator) -> an F that the samples may have missed, or None."""
 Validity = Callable[[FloatArray, FloatArray, float], FloatArray]
 """(points, f, threshold) -> p(v_i), (N,) >= 0, at least one of them > 0."""
 
@@ -170,6 +170,11 @@ class BestModel:
     def __bool__(self) -> bool:
         return self._lowest < math.inf
 
+    @property
+    def final_loss(self) -> Loss:
+        """The loss that ranks locally optimized models."""
+        return self._fine or self.loss
+
     def inlier_share(self) -> float:
         """Return the share of all matches that are within the threshold."""
         return float(np.mean(squared_distances(self._points, self.f) <= self._threshold**2))
@@ -208,7 +213,7 @@ class BestModel:
     def replace_if_better(self, F: FloatArray) -> bool:
         """Replace the best model by the optimized F if its finer penalty is lower; return whether it is."""
         improved = self._improve(F)
-        score = penalty(self._points, 0, improved, self._fine or self.loss, self._lowest, NO_PRETEST)
+        score = penalty(self._points, 0, improved, self.final_loss, self._lowest, NO_PRETEST)
         if score < self._lowest:
             self.f, self._lowest = improved, score
             return True
@@ -274,12 +279,15 @@ class _Loop:
         if not self.best:
             return None
         if self.recipe.recover is not None:
-            pretest = NO_PRETEST if self.adaptive.pretest.random_start else self.adaptive.pretest
-            F = self.best.f.reshape(3, 3)
-            recovered = self.recipe.recover(self.points, F, self.threshold, self.best.loss, pretest, self.state)
-            if recovered is not None:
-                self.best.replace_if_better(recovered)
+            self._recover(self.recipe.recover)
         return Hypothesis(self.best.f.reshape(3, 3), self.trials)
+
+    def _recover(self, recover: Recover) -> None:
+        """Replace the best model by one that the samples have missed, as long as that is better."""
+        better = True
+        while better:
+            F = recover(self.points, self.best.f.reshape(3, 3), self.threshold, self.best.final_loss, self.state)
+            better = F is not None and self.best.replace_if_better(F)
 
     def _draw(self) -> bool:
         """Draw samples until a better model or the next decision; return whether the best model changed."""
