@@ -344,13 +344,10 @@ def estimate_readout(
     bundle: Bundle, rows: Rows, priors: LensPriors, freed: NDArray[np.bool_], scale_px: float,
     start: ReadoutEstimate | None = None, *, known: float | None = None,
 ) -> ReadoutEstimate:  # fmt: skip
-    """Adjust poses, points, cameras and the readout together.
+    """Adjust poses, points, cameras and the readout together; with a known readout, only poses and points.
 
-    Args:
-        bundle: adjusted as if a global shutter had taken its photos; nine or more.
-        freed: (C, 7) parts of the cameras with the wide prior.
-        start: an earlier estimate for the same photos, whose readout and shake are the start.
-        known: the readout, if only poses and points are to be adjusted.
+    The bundle of nine or more photos is adjusted for a global shutter. `freed` (C, 7) are the parts of the cameras with
+    the wide prior; `start` is an earlier estimate for the same photos.
     """
     fits = path_velocities(bundle.R, bundle.t, rows.times).select_most_predictive()
     problem = _Problem(rows, fits, priors, priors.precision(freed), scale_px, known is not None)

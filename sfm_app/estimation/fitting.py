@@ -64,11 +64,7 @@ def find_lenses(
     """Find the cameras whose lens no perspective camera describes, by camera group.
 
     Given cameras are taken, and checked against the matches. `known_lenses` are those of an earlier run, None for no
-    wide lens.
-
-    Raises:
-        InputError: the calibration file fits no photo.
-        ConfigError: the user states panoramas, and some photos are none.
+    wide lens. InputError if the calibration file fits no photo; ConfigError if stated panoramas are none.
     """
     others = [image.name for image in matches.images.values() if image.projection != EQUIRECTANGULAR]
     if run.settings.scene.camera_model == "EQUIRECTANGULAR" and others:

@@ -33,10 +33,8 @@ def assign_cameras(matches: MatchGraph, given: GivenCameras, *, keep: bool) -> A
     """Return the given camera of every camera group that has one.
 
     A group has the camera that the file names for its photos, or by the name of the group; else the only one of the
-    file, or the only one of the size or the shape of its photos. With `keep`, cameras stay unchanged.
-
-    Raises:
-        InputError: the file has no camera for any of the photos.
+    file, or the only one of the size or the shape of its photos. With `keep`, cameras stay unchanged. InputError if the
+    file has no camera for any of the photos.
     """
     if not given:
         return AssignedCameras()

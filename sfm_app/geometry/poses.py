@@ -193,10 +193,7 @@ def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
     """Fit the similarity that maps most of the points a (N, 3) to b, robust to wrong ones.
 
     Least median of squares over triples, then Umeyama on the points within 2.5 robust standard deviations of the best
-    triple (Rousseeuw 1984).
-
-    Raises:
-        NumericalError: fewer than 3 points, or all lie on a line.
+    triple (Rousseeuw 1984). NumericalError for fewer than 3 points, or if all lie on a line.
     """
     count = len(a)
     best, residual = np.inf, np.zeros(count)

@@ -198,10 +198,7 @@ def make_wide_camera(
 ) -> Camera:
     """Return a camera with a given field of view along the longer side, measured from the middle of the photo.
 
-    Args:
-        width, height: pixels, >= 16.
-        field_deg: from one end of the longer side to the other, in degrees, (0, 360); below 180 with "perspective".
-        center: optical center as shares of width and height.
+    The field is below 360 degrees, and below 180 with "perspective". `center` has shares of width and height.
     """
     limit = 180.0 if lens.projection == "perspective" else 360.0
     if min(width, height) < 16 or not 0 < field_deg < limit:

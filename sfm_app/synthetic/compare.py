@@ -34,11 +34,8 @@ def surface_errors(
 
     The reconstruction is aligned with the truth by the similarity between the camera centers. The first distances are
     of points spread evenly over its area, the second those of `seen_points`. The scene's size is the diagonal of the
-    bounding box of the true surface that the photos see.
-
-    Raises:
-        ValueError: fewer than 3 common photos, or the surface has no area.
-        NumericalError: the camera centers lie on a line.
+    bounding box of the true surface that the photos see. ValueError for fewer than 3 common photos or a surface without
+    area; NumericalError if the camera centers lie on a line.
     """
     aligned, size = align_centers(centers, truth)(vertices), scene_size(truth)
     to_truth = surface_distances(sample_surface(aligned, faces, SAMPLES)[0], truth.vertices, truth.faces)

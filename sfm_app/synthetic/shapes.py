@@ -61,14 +61,11 @@ def revolve(
     profile: FloatArray, segments: int = 64, span_deg: float = 360.0, sharp: bool = False,
     flutes: tuple[int, float] = (0, 0.0),
 ) -> Shape:  # fmt: skip
-    """Return the surface of revolution of a profile about the y axis.
+    """Return the surface of revolution of a profile (P, 2), radius and height, about the y axis.
 
-    Args:
-        profile: (P, 2) radius and height; with height up, the outside lies to the right of the path from the first to
-            the last point: a vase runs from its foot to its lip and down the inside.
-        span_deg: angle of the surface; less than 360 leaves the ends open.
-        sharp: whether the points of the profile are sharp edges.
-        flutes: number of grooves around the axis, and their depth as a share of the radius.
+    With height up, the outside lies to the right of the path from the first to the last point: a vase runs from its
+    foot to its lip and down the inside. `sharp` makes the points edges; `flutes` are the number of grooves around the
+    axis, and their depth as a share of the radius.
     """
     strips = [profile[k : k + 2] for k in range(len(profile) - 1)] if sharp else [profile]
     return _build_shape([_revolve_profile(strip, segments, span_deg, flutes) for strip in strips])

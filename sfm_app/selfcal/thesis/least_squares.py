@@ -56,12 +56,8 @@ def fit_camera(
 def find_minima(halves: Halves, weights: FloatArray, starts: FloatArray, equations: Equations = DEFAULT) -> Minima:
     """Run Levenberg-Marquardt from many starts at once, each on its own pairs.
 
-    Thesis (5.8) sums the terms; Levenberg-Marquardt, which the thesis minimizes it with, sums their squares.
-
-    Args:
-        halves: (B, P) pairs.
-        weights: (B, P) >= 0; their scale does not matter.
-        starts: (B, 4) fx, fy, u, v, with focals > 0.
+    Thesis (5.8) sums the terms; Levenberg-Marquardt, which the thesis minimizes it with, sums their squares. `halves`
+    are (B, P) pairs with weights (B, P) of any scale; a start (B, 4) is fx, fy, u, v, with focals > 0.
     """
     scale = np.sqrt(weights / np.sum(weights, axis=1, keepdims=True))[..., None]
 

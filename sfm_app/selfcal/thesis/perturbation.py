@@ -51,12 +51,8 @@ def error_discrepancies(F: FloatArray, K: FloatArray, change: FloatArray) -> Flo
     """Return thesis (5.23): ((s1 - s2) / (2 |D|))^2, the error of E = K'FK over what an error `change` of K explains.
 
     |D| is the spectral norm of the part of E's error that K alone causes. (5.22) prints two transposes in the wrong
-    place; the expansion of (K + dK)' F (K + dK) gives D = dK'FK + K'F dK + dK'F dK.
-
-    Args:
-        F: (P, 3, 3) any scale.
-        K: (3, 3) latest estimate.
-        change: (3, 3) its change since the one before, not zero.
+    place; the expansion of (K + dK)' F (K + dK) gives D = dK'FK + K'F dK + dK'F dK. F (P, 3, 3) has any scale; K is the
+    latest estimate, `change` its change since the one before, not zero.
     """
     s = np.linalg.svd(essential(F, K), compute_uv=False)
     D = change.T @ F @ K + K.T @ F @ change + change.T @ F @ change
