@@ -29,6 +29,7 @@ from benchmarks.common.metrics import (
 from benchmarks.common.results import RESULTS, Row, document, pivot, table, write
 from benchmarks.common.timing import Method, take_turns, timing
 from benchmarks.fundamental.ablation import ablated_estimators
+from benchmarks.fundamental.facades import cached_facade_pairs
 from benchmarks.fundamental.methods import BASELINE, RIVALS, our_estimators, rivals
 from benchmarks.fundamental.real_pairs import (
     LEAST_SHARE,
@@ -205,6 +206,7 @@ def _title(task: str) -> str:
     return {
         "real": "Fundamental matrices on real matches without a ratio test",
         "ratio": "Fundamental matrices on real matches after the ratio test",
+        "facades": "Fundamental matrices on rendered facades without a ratio test",
         "synthetic": "Fundamental matrices on synthetic pairs",
         "two-motions": "Fundamental matrices with two motions",
     }[task]
@@ -230,7 +232,10 @@ def parser() -> argparse.ArgumentParser:
     parser = new_parser("fundamental", __doc__)
     parser.add_argument("--real", type=Path, metavar="DATA", help="folder with pairs/*.npz (see real_pairs.py)")
     parser.add_argument("--ratio", type=Path, metavar="DATA", help="folder with NAME/images and NAME/cameras.json")
-    parser.add_argument("--cache", type=Path, help="where the matches of --ratio are kept")
+    parser.add_argument(
+        "--facades", type=int, metavar="N", help="rendered facades, most of whose matches lie in a plane"
+    )
+    parser.add_argument("--cache", type=Path, help="where the matches of --ratio and --facades are kept")
     parser.add_argument("--sets", nargs="+", default=RATIO_SETS, help="photo sets of --ratio")
     parser.add_argument("--pairs-per-set", type=int, help="limit of pairs per set, evenly spaced")
     parser.add_argument("--synthetic", type=int, metavar="N", help="pairs per level of outliers; 200 in the thesis")
@@ -248,10 +253,10 @@ def parse_arguments() -> argparse.Namespace:
     """Read the command line, and refuse options that do not fit together."""
     line = parser()
     args = line.parse_args()
-    if not any((args.real, args.ratio, args.synthetic, args.two_motions)):
-        line.error("name at least one of --real, --ratio, --synthetic, --two-motions")
-    if args.ratio and not args.cache:
-        line.error("--ratio needs --cache")
+    if not any((args.real, args.ratio, args.facades, args.synthetic, args.two_motions)):
+        line.error("name at least one of --real, --ratio, --facades, --synthetic, --two-motions")
+    if (args.ratio or args.facades) and not args.cache:
+        line.error("--ratio and --facades need --cache")
     return args
 
 
@@ -267,6 +272,8 @@ def main() -> None:
         run_real("real", sorted((args.real / "pairs").glob("*.npz")), methods, args)
     if args.ratio:
         run_real("ratio", [cached_ratio_matches(args.ratio, name, args.cache) for name in args.sets], methods, args)
+    if args.facades:
+        run_real("facades", [cached_facade_pairs(k, args.cache) for k in range(args.facades)], methods, args)
     if args.synthetic:
         run_synthetic(args.synthetic, methods, args)
     if args.two_motions:

@@ -96,7 +96,7 @@ def cached_ratio_matches(data: Path, name: str, cache: Path) -> Path:
         for ids in graph.matches:
             first, second = (Path(graph.images[key].name).stem for key in ids)
             if first in truth and second in truth and len(graph.matches[ids]):
-                fields = _true_fields(truth[first], truth[second]) | dict(
+                fields = true_fields(truth[first], truth[second]) | dict(
                     zip(("x1", "x2"), graph.points(ids), strict=True)
                 )
                 arrays |= {f"{first}-{second}/{field}": value for field, value in fields.items()}
@@ -104,7 +104,8 @@ def cached_ratio_matches(data: Path, name: str, cache: Path) -> Path:
     return path
 
 
-def _true_fields(first: tuple[FloatArray, FloatArray], second: tuple[FloatArray, FloatArray]) -> dict[str, FloatArray]:
+def true_fields(first: tuple[FloatArray, FloatArray], second: tuple[FloatArray, FloatArray]) -> dict[str, FloatArray]:
+    """Return the fields of a pair besides its matches, from K and (3, 4) cam_from_world of both photos."""
     (K1, pose1), (K2, pose2) = first, second
     R = pose2[:, :3] @ pose1[:, :3].T
     t = pose2[:, 3] - R @ pose1[:, 3]
