@@ -80,7 +80,7 @@ def reconstruct(
     mapper, start = Mapper(run, mappers), time.monotonic()
     first = mapper.map(evidence)
     seconds = time.monotonic() - start
-    trial = Trial.of(FIRST_TRIAL, "", (NoModel(), first), seconds, first.notes, accepted=True)
+    trial = Trial.of(FIRST_TRIAL, "", NoModel(), first, accepted=True, seconds=seconds, notes=first.notes)
     first = replace(first, trials=(trial, *within(FIRST_TRIAL, first)))
     best = improve(first, mapper, ALL if hypotheses is None else hypotheses)
     return with_doubtful_joins(best, mapper)
@@ -105,8 +105,8 @@ def improve(best: Outcome, mapper: Mapper, hypotheses: Iterable[Hypothesis]) -> 
                 break
             if sum(trial.seconds for trial in best.trials if trial.is_hypothesis) >= options.hypotheses_s:
                 failure = f"no time was left, of {options.hypotheses_s:g} s"
-                late = Trial.of(hypothesis.name, reason, (best, best), accepted=False, failure=failure)
-                best = replace(best, trials=(*best.trials, late))
+                late = Trial.of(hypothesis.name, reason, best, best, accepted=False)
+                best = replace(best, trials=(*best.trials, replace(late, failure=failure)))
                 break
             best, accepted = _try(hypothesis, reason, best, mapper)
             if not accepted:
@@ -122,14 +122,16 @@ def _try(hypothesis: Hypothesis, reason: str, best: Outcome, mapper: Mapper) -> 
         for other in hypothesis.outcomes(best, mapper):
             accepted = is_better(other, best, mapper)
             trials += within(hypothesis.name, other)
-            rest = time.monotonic() - start, other.notes
-            trials.append(Trial.of(hypothesis.name, reason, (best, other), *rest, accepted=accepted))
+            seconds, notes = time.monotonic() - start, other.notes
+            trial = Trial.of(hypothesis.name, reason, best, other, accepted=accepted, seconds=seconds, notes=notes)
+            trials.append(trial)
             best, start = other if accepted else best, time.monotonic()
     except BackendError as err:  # the best outcome is not lost with it; errors of ours are not hidden
         failure = str(err)
     if failure or len(trials) == len(first.trials):
         seconds = time.monotonic() - start
-        trials.append(Trial.of(hypothesis.name, reason, (best, best), seconds, (), failure, accepted=False))
+        trial = Trial.of(hypothesis.name, reason, best, best, accepted=False, seconds=seconds)
+        trials.append(replace(trial, failure=failure))
     mapper.write(best)
     return replace(best, trials=tuple(trials)), best is not first
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from sfm_app.camera.models import GUESSED_FOCAL, guessed_camera_matrix
 from sfm_app.colmap.backend import run_interruptible, translate_errors
@@ -59,7 +59,7 @@ class Trial:
     """Photos of the main model before and with it."""
     support: tuple[float, float]
     """Support of the main model before and with it."""
-    seconds: float = 0.0
+    seconds: float
     notes: tuple[str, ...] = ()
     """How its models were made; for people."""
     failure: str = ""
@@ -67,13 +67,12 @@ class Trial:
 
     @classmethod
     def of(
-        cls, name: str, reason: str, both: Sequence["MappingResult | Outcome"], *rest: Any, accepted: bool, **more: Any
-    ) -> "Trial":
-        """Compare the results before and with it; the others are the fields from `seconds` on."""
-        before, after = both
-        return cls(
-            name, reason, accepted, (before.photos, after.photos), (before.support, after.support), *rest, **more
-        )
+        cls, name: str, reason: str, before: "MappingResult | Outcome", after: "MappingResult | Outcome", *,
+        accepted: bool, seconds: float = 0.0, notes: tuple[str, ...] = (),
+    ) -> "Trial":  # fmt: skip
+        """Compare the results before and with a hypothesis."""
+        photos, supports = (before.photos, after.photos), (before.support, after.support)
+        return cls(name, reason, accepted, photos, supports, seconds, notes)
 
     @property
     def is_hypothesis(self) -> bool:
@@ -150,11 +149,10 @@ class MappedGroup(NamedTuple):
         """Yield the hypotheses of a pass that were tried: the global mapper, and a split of the best model."""
         for number, one in enumerate(self.results):
             if one.reason:
-                both = best_attempt(self.results[:number]) or NoModel(), one
-                rest = one.seconds, (one.note,)
-                yield Trial.of("global-mapper", one.reason, both, *rest, accepted=one is self.best)
+                first, own, notes = best_attempt(self.results[:number]) or NoModel(), one is self.best, (one.note,)
+                yield Trial.of("global-mapper", one.reason, first, one, accepted=own, seconds=one.seconds, notes=notes)
         if self.best is not None and len(self.parts) > 1:
-            yield Trial.of("splits", CONTRADICTED_JOIN, (self.best, self.parts[0]), accepted=True)
+            yield Trial.of("splits", CONTRADICTED_JOIN, self.best, self.parts[0], accepted=True)
 
 
 def _outcome_of(groups: Sequence[MappedGroup], start: Outcome) -> Outcome:
