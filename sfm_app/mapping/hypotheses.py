@@ -270,8 +270,7 @@ def _shared_camera_reason(best: Outcome, mapper: Mapper) -> str:
 def _with_camera_per_photo(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
     intrinsics = _camera_per_photo(best)
     if intrinsics is not None:
-        own = mapper.map(replace(best.trusted, intrinsics=intrinsics)).with_earlier(best)
-        yield improve(own, mapper, [RIVAL])
+        yield mapper.map(replace(best.trusted, intrinsics=intrinsics)).with_earlier(best)
 
 
 def _camera_per_photo(best: Outcome) -> Intrinsics | None:
