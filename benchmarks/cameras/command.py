@@ -16,10 +16,11 @@ from pathlib import Path
 
 from benchmarks.cameras.bars import BARS
 from benchmarks.cameras.measure import OWN_CAMERA_SETS, measure, warm_up
-from benchmarks.cameras.methods import STOCK, Method, methods, rotate_methods
+from benchmarks.cameras.methods import STOCK, Method, group_by_size, methods, rotate_methods, told_methods
 from benchmarks.cameras.report import draw, medians, page
+from benchmarks.cameras.score import true_photos
 from benchmarks.common.command_line import add_pictures, add_results, is_wanted, new_parser, overrides
-from benchmarks.common.photo_sets import PhotoSet, photo_set
+from benchmarks.common.photo_sets import PhotoSet, photo_set, steps
 from benchmarks.common.results import Row, document, write
 
 EXTRA_SETTINGS: tuple[str, ...] = ()
@@ -50,14 +51,22 @@ def run_all(args: argparse.Namespace, these: Sequence[Method], cache: Path) -> I
     sets = list(chosen_sets(args, cache))
     warm_up([photos for photos, _ in sets], these, cache / "cameras" / "warm-up")
     for photos, name in sets:
+        of_set = [*these, *told_to_stock(args, photos, name)]
         for repetition in range(max(args.repeat, 1 + args.twice)):
-            for method in rotate_methods(these, repetition):
+            for method in rotate_methods(of_set, repetition):
                 if method.kind in STOCK and repetition >= args.repeat:
                     continue
                 out = cache / "cameras" / photos.folder.name / method.name.replace(" ", "_")
                 row = measure(photos, args.data / name / "cameras.json", method, out)
                 print(json.dumps(row), file=sys.stderr, flush=True)
                 yield row | {"repetition": repetition}
+
+
+def told_to_stock(args: argparse.Namespace, photos: PhotoSet, name: str) -> list[Method]:
+    """Return stock with what it is told of the camera, on a set whose photos share a size and a true camera."""
+    truth = true_photos(args.data / name / "cameras.json", steps(photos.name.partition(" ")[2])).values()
+    cameras, sizes = {photo.K.tobytes(): photo.K for photo in truth}, list(group_by_size(photos.folder))
+    return told_methods(next(iter(cameras.values())), sizes[0], args.told) if len(cameras) == len(sizes) == 1 else []
 
 
 def parser() -> argparse.ArgumentParser:
@@ -74,6 +83,10 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--also", nargs="*", default=EXTRA_SETTINGS, metavar="TABLE.KEY=VALUE", help="run ours with it, too"
     )
+    parser.add_argument(
+        "--told", nargs="*", type=float, default=[], metavar="PERCENT",
+        help="stock told of a focal that is so far off, too; with 0, of the true K",
+    )  # fmt: skip
     parser.add_argument("--repeat", type=int, default=1, metavar="N", help="runs of every method")
     parser.add_argument("--twice", action="store_true", help="run ours at least twice and compare the bytes")
     add_results(parser, "cameras")

@@ -46,7 +46,7 @@ def score_run(said: Row, photos: PhotoSet, truth: Mapping[str, TruePhoto], metho
     models = read_models(out)
     row = {"photos": photos.name, "method": method.name, "failed": said["failed"], "exit code": said["exit code"]}
     row |= accuracy(models, truth, _photo_count(photos)) | times(said["seconds"], complete=not said["failed"])
-    row |= {name: said[name] for name in ("wall seconds", "peak MB")}
+    row |= {name: said.get(name) for name in ("wall seconds", "CPU seconds", "peak MB")}
     if method.kind == OURS:
         row |= errors_before_adjustment(out, truth) | hashes(out)
         row |= stated_deviations(out, models[0], truth) if models else {}

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from benchmarks.cameras.worker import GLOBAL, INCREMENTAL, OURS, RESULT
@@ -33,6 +35,11 @@ class Method:
     """Hypothesis about the photos that is switched off; such a run resumes a finished one at its scene."""
 
 
+def is_stock(name: str) -> bool:
+    """Return whether a method of this name is stock pycolmap, told of a camera or not."""
+    return name.partition(",")[0] in STOCK
+
+
 def methods(also: Mapping[str, Mapping[str, Any]], *, ours_only: bool = False) -> list[Method]:
     """List the program with its defaults, the program with other settings, and pycolmap's two mappers."""
     ours = [Method(OURS), *(Method(f"{OURS}, {label}", OURS, settings) for label, settings in also.items())]
@@ -42,6 +49,25 @@ def methods(also: Mapping[str, Mapping[str, Any]], *, ours_only: bool = False) -
 def ablations(names: Sequence[str]) -> list[Method]:
     """List the program without each hypothesis."""
     return [Method(f"{OURS}, without {name}", OURS, {"scene": {"without": [name]}}, name) for name in names]
+
+
+def told_methods(K: NDArray[np.float64], size: tuple[int, int], errors: Sequence[float]) -> list[Method]:
+    """List stock incremental with a focal that is off by each error in percent; for 0, with the true K, and kept.
+
+    A network states a focal. The center stays in the middle, as in COLMAP.
+    """
+    focal, stated = float(K[0, 0] * K[1, 1]) ** 0.5, []
+    for error in errors:
+        told: dict[str, Any] = {
+            "camera_model": "SIMPLE_RADIAL",
+            "camera_params": f"{(1 + error / 100) * focal},{size[0] / 2},{size[1] / 2},0",
+        }
+        if error == 0:
+            entries = (float(K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+            told = {"camera_model": "PINHOLE", "camera_params": ",".join(map(str, entries)), "keep_camera": True}
+        name = f"focal {error:g} % off" if error else "true K"
+        stated.append(Method(f"{INCREMENTAL}, told: {name}", INCREMENTAL, told))
+    return stated
 
 
 def rotate_methods(these: Sequence[Method], repetition: int) -> list[Method]:

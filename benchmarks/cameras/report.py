@@ -7,7 +7,7 @@ from statistics import median
 import numpy as np
 
 from benchmarks.cameras.bars import BARS, verdict
-from benchmarks.cameras.methods import STOCK
+from benchmarks.cameras.methods import is_stock
 from benchmarks.cameras.score import FILES
 from benchmarks.cameras.worker import INCREMENTAL
 from benchmarks.common.figures import pyplot, save
@@ -19,7 +19,7 @@ ACCURACY = (
 )  # fmt: skip
 TIME = (
     "photos", "method", "read", "features + matches", "view graph", "K", "map + BA", "total", "/ incremental",
-    "fastest", "slowest", "peak MB",
+    "fastest", "slowest", "CPU seconds", "peak MB",
 )  # fmt: skip
 SPREAD = ("f", "fx", "fy", "cx", "cy")
 DEVIATIONS = (
@@ -37,7 +37,7 @@ def medians(runs: Sequence[Row]) -> list[Row]:
     rows = [_median_row(repeated) for repeated in together.values()]
     for row in rows:
         of_methods = {other["method"]: other for other in rows if other["photos"] == row["photos"]}
-        bars = () if row["method"] in STOCK else BARS.get(row["photos"], ())
+        bars = () if is_stock(row["method"]) else BARS.get(row["photos"], ())
         row["bar met"] = verdict(row, of_methods, bars)
     return rows
 
@@ -83,7 +83,7 @@ def compare_bytes(repeated: Sequence[Row]) -> str | None:
 
 def page(about: str, rows: Sequence[Row], picture: str = "") -> str:
     """Return the page with its tables, without columns that are empty throughout, and a picture by its name."""
-    ours = [row for row in rows if row["method"] not in STOCK]
+    ours = [row for row in rows if not is_stock(row["method"])]
     repeated = [row for row in ours if row["same bytes"]]
     parts = [
         f"# Cameras\n\n{about}\n",

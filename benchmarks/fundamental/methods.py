@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 
 BASELINE = "OpenCV MAGSAC++"
 """The rival that times are divided by."""
-RIVALS = ("OpenCV RANSAC", BASELINE, "PoseLib", "pycolmap LO-RANSAC")
+RIVALS = ("OpenCV RANSAC", BASELINE, "PoseLib", "pycolmap LO-RANSAC", "SupeRANSAC")
 
 
 def our_estimators(names: Sequence[str], options: EpipolarSettings) -> dict[str, Method]:
@@ -43,7 +43,7 @@ def _our_estimator(name: str, options: EpipolarSettings) -> Method:
 def rivals(names: Sequence[str], options: EpipolarSettings) -> dict[str, Method]:
     """Return rivals by name, with our threshold, confidence and limit; what they return is not judged any further."""
     cv2.setNumThreads(1)
-    makers = (_opencv(cv2.FM_RANSAC), _opencv(cv2.USAC_MAGSAC), _poselib, _pycolmap)
+    makers = (_opencv(cv2.FM_RANSAC), _opencv(cv2.USAC_MAGSAC), _poselib, _pycolmap, _superansac)
     return {name: make(options) for name, make in zip(RIVALS, makers, strict=True) if name in names}
 
 
@@ -80,5 +80,23 @@ def _pycolmap(options: EpipolarSettings) -> Method:
         ransac.min_num_trials, ransac.max_num_trials = 100, options.max_trials
         found = pycolmap.estimate_fundamental_matrix(x1, x2, ransac)
         return (None if found is None else found["F"]), None
+
+    return fit
+
+
+def _superansac(options: EpipolarSettings) -> Method:
+    try:
+        import pysuperansac
+    except ImportError:
+        raise SystemExit("pysuperansac is missing: pip install -e '.[bench]' (Python 3.11 on Linux)") from None
+
+    def fit(x1: FloatArray, x2: FloatArray, seed: int) -> tuple[FloatArray | None, int | None]:  # noqa: ARG001
+        settings = pysuperansac.RANSACSettings()  # a call changes its settings: with used ones, the next one is wrong
+        settings.inlier_threshold, settings.confidence = options.max_error_px, options.confidence
+        settings.max_iterations = options.max_trials
+        settings.sampler = pysuperansac.SamplerType.Uniform  # its default expects matches sorted by quality
+        sizes = [float(one[:, axis].max()) + 1.0 for one in (x1, x2) for axis in (0, 1)]
+        F = np.asarray(pysuperansac.estimateFundamentalMatrix(np.hstack([x1, x2]), sizes, [], settings)[0])
+        return (F if F.shape == (3, 3) else None), None
 
     return fit

@@ -9,7 +9,7 @@ import numpy as np
 
 import sfm_app
 from benchmarks.common.photo_sets import PhotoSet, TrueCamera
-from benchmarks.selfcal import view_graph_calibration as rival
+from benchmarks.selfcal import rivals
 from sfm_app.api import open_run
 from sfm_app.camera.models import camera_matrix
 from sfm_app.estimation.calibrating import photo_pairs
@@ -107,12 +107,15 @@ def run_calibrator(subject: MatchedSet, method: str) -> MethodResult:
     return MethodResult(method, cameras, seconds, pairs)
 
 
-def run_colmap(subject: MatchedSet) -> MethodResult:
-    """Run COLMAP's view-graph calibration."""
+def run_rivals(subject: MatchedSet) -> Iterator[MethodResult]:
+    """Run COLMAP's view-graph calibration and PoseLib's iterated focals."""
+    images, fits = subject.matches.images, len(subject.views.fits)
     database = subject.out / "database.db"
-    found, seconds = rival.view_graph_calibration(database, subject.out, subject.matches, subject.views)
-    cameras = {Path(subject.matches.images[key].name).stem: camera for key, camera in found.items()}
-    return MethodResult(rival.METHOD, cameras, seconds, len(subject.views.fits))
+    calibrated = rivals.view_graph_calibration(database, subject.out, subject.matches, subject.views)
+    iterated = rivals.iterated_focals(subject.matches, subject.views)
+    for method, (found, seconds) in ((rivals.VIEW_GRAPH, calibrated), (rivals.ITERATED, iterated)):
+        cameras = {Path(images[key].name).stem: camera for key, camera in found.items()}
+        yield MethodResult(method, cameras, seconds, fits)
 
 
 def run_every_method(
@@ -122,7 +125,7 @@ def run_every_method(
     yield run_production(subject)
     for label, overrides in others.items():
         yield run_production(subject, overrides, f"{PRODUCTION}, {label}")
-    yield run_colmap(subject)
+    yield from run_rivals(subject)
     for method in (WITHOUT_MATCHES, *(name for name in methods if name != PRODUCTION)):
         yield run_calibrator(subject, method)
 

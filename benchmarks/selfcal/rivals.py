@@ -1,7 +1,8 @@
-"""COLMAP's view-graph calibration on our fundamental matrices: the rival of zero curves."""
+"""Rivals of zero curves on our fundamental matrices: COLMAP's view-graph calibration, focals of pairs by PoseLib."""
 
 import shutil
 import time
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import open_database
 from sfm_app.types import Calibration, MatchGraph, ViewGraph
 
-METHOD = "view-graph calibration"
+VIEW_GRAPH = "view-graph calibration"
+ITERATED = "iterated focals, PoseLib"
+"""Kocur, Kyselica and Kukelova (CVPR 2024); a camera gets the median of its pairs."""
 
 
 def view_graph_calibration(
@@ -71,4 +74,34 @@ def _to_calibration(camera: Any, done: bool) -> Calibration:
     K = np.asarray(camera.calibration_matrix(), np.float64)
     known = done and camera.has_prior_focal_length  # COLMAP sets it where it accepts its estimate
     reason = "" if known else "kept the guess" if done else "gave up"
-    return Calibration(K, camera.width, camera.height, METHOD, identifiable=known, reason=reason)
+    return Calibration(K, camera.width, camera.height, VIEW_GRAPH, identifiable=known, reason=reason)
+
+
+def iterated_focals(matches: MatchGraph, views: ViewGraph) -> tuple[dict[int, Calibration], float]:
+    """Estimate focals pair by pair, from the usual guess and with its weights; centers stay in the middle.
+
+    Returns:
+        Calibrations by image id, and seconds. A camera without a pair counts as not identifiable.
+    """
+    import poselib
+
+    images, focals = matches.images, defaultdict[str, list[float]](list)
+    guesses = {k: guessed_camera_matrix((image.width, image.height)) for k, image in images.items()}
+    start = time.perf_counter()
+    for pair, fit in views.fits.items():
+        if not fit.degeneracy:
+            sizes = [{"model": "SIMPLE_PINHOLE", "width": images[k].width, "height": images[k].height} for k in pair]
+            cameras = [
+                size | {"params": [guesses[k][0, 0], *guesses[k][:2, 2]]} for size, k in zip(sizes, pair, strict=True)
+            ]
+            for k, found in zip(pair, poselib.focals_from_fundamental_iterative(fit.matrix, *cameras), strict=False):
+                focals[images[k].group].append(found.params[0])
+    medians = {name: float(np.median(values)) for name, values in focals.items()}
+    seconds = time.perf_counter() - start
+    found = {}
+    for k, image in images.items():
+        K = guessed_camera_matrix((image.width, image.height), medians.get(image.group))
+        known = image.group in medians
+        reason = "" if known else "no pair"
+        found[k] = Calibration(K, image.width, image.height, ITERATED, identifiable=known, reason=reason)
+    return found, seconds
