@@ -58,14 +58,13 @@ def told_methods(K: NDArray[np.float64], size: tuple[int, int], errors: Sequence
     """
     focal, stated = float(K[0, 0] * K[1, 1]) ** 0.5, []
     for error in errors:
-        told: dict[str, Any] = {
-            "camera_model": "SIMPLE_RADIAL",
-            "camera_params": f"{(1 + error / 100) * focal},{size[0] / 2},{size[1] / 2},0",
-        }
-        if error == 0:
-            entries = (float(K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
-            told = {"camera_model": "PINHOLE", "camera_params": ",".join(map(str, entries)), "keep_camera": True}
-        name = f"focal {error:g} % off" if error else "true K"
+        if error:
+            name, model = f"focal {error:g} % off", "SIMPLE_RADIAL"
+            params = [(1 + error / 100) * focal, size[0] / 2, size[1] / 2, 0.0]
+        else:
+            name, model, params = "true K", "PINHOLE", [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+        text = ",".join(str(float(value)) for value in params)
+        told = {"camera_model": model, "camera_params": text, "keep_camera": not error}
         stated.append(Method(f"{INCREMENTAL}, told: {name}", INCREMENTAL, told))
     return stated
 

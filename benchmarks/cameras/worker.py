@@ -71,10 +71,10 @@ def run_stock(photos: Path, out: Path, options: Mapping[str, Any], mapper: str) 
         lap("calibrate")
         pycolmap.global_mapping(database, photos, sparse)
     else:
-        known = pycolmap.IncrementalPipelineOptions()
+        incremental = pycolmap.IncrementalPipelineOptions()
         if options.get("keep_camera"):
-            known.ba_refine_focal_length = known.ba_refine_extra_params = False
-        pycolmap.incremental_mapping(database, photos, sparse, known)
+            incremental.ba_refine_focal_length = incremental.ba_refine_extra_params = False
+        pycolmap.incremental_mapping(database, photos, sparse, incremental)
     lap("map")
     return {"failed": "", "exit code": 0, "seconds": seconds, "peak MB": peak_mb()}
 

@@ -4,6 +4,7 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,14 @@ from sfm_app.cli.options import parse_assignment
 from sfm_app.settings import merge_nested
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+def import_rival(name: str) -> Any:
+    """Return the module of a rival that the extra `bench` installs; end the program where it is missing."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise SystemExit(f"{name} is missing: pip install -e '.[bench]', where it has a wheel") from None
 
 
 def new_parser(subject: str, text: str | None) -> argparse.ArgumentParser:

@@ -43,7 +43,7 @@ def document(task: str, about: str, options: Mapping[str, Any], data: Mapping[st
         "options": dict(options),
         "data": dict(data),
         "machine": machine,
-        "versions": program_versions() | _installed_version("poselib"),
+        "versions": program_versions() | _installed_version("poselib") | _installed_version("pysuperansac"),
         "rows": list(rows),
     }
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sfm_app
+from benchmarks.common.command_line import import_rival
 from benchmarks.common.timing import Method
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.plugins import load_plugins
@@ -20,6 +21,8 @@ FloatArray = NDArray[np.float64]
 BASELINE = "OpenCV MAGSAC++"
 """The rival that times are divided by."""
 RIVALS = ("OpenCV RANSAC", BASELINE, "PoseLib", "pycolmap LO-RANSAC", "SupeRANSAC")
+QUICK = RIVALS[:-1]
+"""Rivals that run unless others are named: SupeRANSAC takes seconds for a pair with many outliers."""
 
 
 def our_estimators(names: Sequence[str], options: EpipolarSettings) -> dict[str, Method]:
@@ -56,10 +59,7 @@ def _opencv(flag: int) -> Any:
 
 
 def _poselib(options: EpipolarSettings) -> Method:
-    try:
-        import poselib
-    except ImportError:
-        raise SystemExit("poselib is missing: pip install -e '.[bench]'") from None
+    poselib = import_rival("poselib")
     limits = {
         "max_epipolar_error": options.max_error_px,
         "success_prob": options.confidence,
@@ -85,10 +85,7 @@ def _pycolmap(options: EpipolarSettings) -> Method:
 
 
 def _superansac(options: EpipolarSettings) -> Method:
-    try:
-        import pysuperansac
-    except ImportError:
-        raise SystemExit("pysuperansac is missing: pip install -e '.[bench]' (Python 3.11 on Linux)") from None
+    pysuperansac = import_rival("pysuperansac")
 
     def fit(x1: FloatArray, x2: FloatArray, seed: int) -> tuple[FloatArray | None, int | None]:  # noqa: ARG001
         settings = pysuperansac.RANSACSettings()  # a call changes its settings: with used ones, the next one is wrong

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.common.command_line import import_rival
 from sfm_app.camera.models import guessed_camera_matrix
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import open_database
@@ -83,25 +84,24 @@ def iterated_focals(matches: MatchGraph, views: ViewGraph) -> tuple[dict[int, Ca
     Returns:
         Calibrations by image id, and seconds. A camera without a pair counts as not identifiable.
     """
-    import poselib
-
+    poselib = import_rival("poselib")
     images, focals = matches.images, defaultdict[str, list[float]](list)
-    guesses = {k: guessed_camera_matrix((image.width, image.height)) for k, image in images.items()}
+    guesses = {}
+    for k, image in images.items():
+        focal = guessed_camera_matrix((image.width, image.height))[0, 0]
+        params = [focal, image.width / 2, image.height / 2]
+        guesses[k] = {"model": "SIMPLE_PINHOLE", "width": image.width, "height": image.height, "params": params}
     start = time.perf_counter()
     for pair, fit in views.fits.items():
         if not fit.degeneracy:
-            sizes = [{"model": "SIMPLE_PINHOLE", "width": images[k].width, "height": images[k].height} for k in pair]
-            cameras = [
-                size | {"params": [guesses[k][0, 0], *guesses[k][:2, 2]]} for size, k in zip(sizes, pair, strict=True)
-            ]
-            for k, found in zip(pair, poselib.focals_from_fundamental_iterative(fit.matrix, *cameras), strict=False):
-                focals[images[k].group].append(found.params[0])
+            *found, _ = poselib.focals_from_fundamental_iterative(fit.matrix, *(guesses[k] for k in pair))
+            for k, camera in zip(pair, found, strict=True):
+                focals[images[k].group].append(camera.params[0])
     medians = {name: float(np.median(values)) for name, values in focals.items()}
     seconds = time.perf_counter() - start
-    found = {}
+    calibrated = {}
     for k, image in images.items():
-        K = guessed_camera_matrix((image.width, image.height), medians.get(image.group))
-        known = image.group in medians
-        reason = "" if known else "no pair"
-        found[k] = Calibration(K, image.width, image.height, ITERATED, identifiable=known, reason=reason)
-    return found, seconds
+        focal, size = medians.get(image.group), (image.width, image.height)
+        K, reason = guessed_camera_matrix(size, focal), "no pair" if focal is None else ""
+        calibrated[k] = Calibration(K, *size, ITERATED, identifiable=focal is not None, reason=reason)
+    return calibrated, seconds
