@@ -33,10 +33,10 @@ from benchmarks.lenses.bundles import (
 from benchmarks.lenses.radius import radius_error_percent
 from sfm_app.bundle.lens_evidence import estimate_lenses
 from sfm_app.bundle.lens_parts import PARTS, model_name
-from sfm_app.bundle.normal_equations import Bundle, best_step, project, reduce, residuals
+from sfm_app.bundle.normal_equations import Bundle, best_step, bundle_scale, project, reduce, residuals
 from sfm_app.camera.rows import FISHEYE, PERSPECTIVE
 from sfm_app.colmap.backend import pycolmap, show_log
-from sfm_app.colmap.bundle import LOSS_SCALE_PX, Adjustment, adjust, lens_priors, read_bundle
+from sfm_app.colmap.bundle import Adjustment, adjust, lens_priors, read_bundle
 
 FloatArray = NDArray[np.float64]
 
@@ -180,16 +180,16 @@ def held_out_likelihoods(
     out = np.random.default_rng(seed).integers(FOLDS, size=len(bundle.x)) == 0
     out &= np.bincount(bundle.point[~out], minlength=len(bundle.X))[bundle.point] >= 2
     train = replace(bundle, photo=bundle.photo[~out], point=bundle.point[~out], x=bundle.x[~out])
-    noise_px = []
+    noise_px, scale_px = [], bundle_scale(bundle)
     for _ in range(REFITS):
-        reduced = reduce(train, LOSS_SCALE_PX)
+        reduced = reduce(train, scale_px)
         noise_px.append(reduced.noise_px)
         priors = replace(lens_priors(model, ids, train), choices=(choice,))
-        train = best_step(train, reduced, estimate_lenses(train.params, reduced, priors).params, LOSS_SCALE_PX)
+        train = best_step(train, reduced, estimate_lenses(train.params, reduced, priors).params, scale_px)
     test = replace(train, photo=bundle.photo[out], point=bundle.point[out], x=bundle.x[out])
     r2 = np.sum(residuals(test, project(test)[0]) ** 2, axis=1)
     # the first step's noise is that of the adjusted bundle, the same for all that are compared
-    losses = (LOSS_SCALE_PX / noise_px[0]) ** 2 * (np.sqrt(1.0 + r2 / LOSS_SCALE_PX**2) - 1.0)
+    losses = 0.5 * (scale_px / noise_px[0]) ** 2 * np.log1p(r2 / scale_px**2)
     return np.asarray(-losses, np.float64)
 
 

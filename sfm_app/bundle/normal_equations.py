@@ -5,6 +5,7 @@ sparse matrices eliminates all points: time grows with the squares of the track 
 photos that share a point.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -39,6 +40,8 @@ class ReductionOptions:
     """Prior noise of a keypoint coordinate: the usual noise of SIFT. Chosen by hand."""
     usual_count: float = 4.0
     """Weight of the prior noise as a number of measurements; it matters with few observations. Chosen by hand."""
+    efficient_scale: float = 2.385
+    """Scale of Cauchy's loss in standard deviations of the noise (Holland and Welsch 1977)."""
     lost_px: float = 1e4
     """Residual above which an observation is lost, i.e. not used; a lost observation costs as much. Chosen by hand."""
     max_derivative: float = 1e60
@@ -140,6 +143,8 @@ class Linearized:
     """(P,) from `whiten_points`."""
     used: int
     """Number of observations that are not lost."""
+    inflation: float
+    """Variance of an estimate with this loss, over that of squared weighted residuals over H."""
 
     def eliminate_points(self) -> "sparse.csr_array":
         """Return the matrix (V, V) of the unknowns besides the points (Schur complement)."""
@@ -179,7 +184,20 @@ def linearize(
     by_view = by_view.reshape(count, 2, k, BLOCK).transpose(0, 2, 1, 3).reshape(-1, 2, BLOCK)
     J = bsr_array((by_view, blocks.ravel(), k * rows), shape=(2 * count, unknowns))
     B = bsr_array((by_point, bundle.point, rows), shape=(2 * count, 3 * len(bundle.X)))
-    return Linearized(r.ravel(), J, B, B.T @ J, whiten, rank, int(np.count_nonzero(used)))
+    inflation = variance_inflation(np.einsum("ni,ni->n", r[used], r[used]) / scale_px**2)
+    return Linearized(r.ravel(), J, B, B.T @ J, whiten, rank, int(np.count_nonzero(used)), inflation)
+
+
+def variance_inflation(u: FloatArray) -> float:
+    """Return the variance of an M-estimator (Huber 1981) over that of weighted least squares with its weights.
+
+    The squares (N,) of weighted residuals are over that of the scale. The weight is 1 - u, and the mean derivative
+    of the influence, over both directions in the image, its square.
+    """
+    weight = 1.0 - u
+    if not np.any(u):
+        return 1.0
+    return float(np.sum(weight * u) / np.sum(u) * np.mean(weight) / np.mean(weight**2) ** 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -240,7 +258,7 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
     """Eliminate points, then poses (Schur complement), in the Gauss-Newton approximation.
 
     The covariance of the cameras is noise^2 H^-1. It is accurate where poses and points minimize the cost. The loss is
-    COLMAP's SOFT_L1, s^2 (sqrt(1 + |r|^2 / s^2) - 1), with s = `scale_px`.
+    Cauchy's, s^2 / 2 log(1 + |r|^2 / s^2), with s = `scale_px`.
     """
     from scipy.sparse import bsr_array, eye_array
 
@@ -261,7 +279,10 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
     H = project_to_psd(0.5 * (H + H.T), before[poses:])
     step = solve_positive(H, g[:, None])[:, 0]
     explained = np.sum(gradient[free] * response[:, -1]) + np.sum(g * step)
-    noise = max(float(np.sum(rest**2) - explained), 0.0) + REDUCTION.usual_count * REDUCTION.usual_noise_px**2
+    noise = (
+        observed.inflation * max(float(np.sum(rest**2) - explained), 0.0)
+        + REDUCTION.usual_count * REDUCTION.usual_noise_px**2
+    )
     redundancy = max(2 * observed.used - int(np.sum(observed.rank)) - len(free) - cameras, 0) + REDUCTION.usual_count
     pose_step, pose_response = np.zeros(poses), np.zeros((poses, cameras))
     pose_step[free], pose_response[free] = response[:, -1], response[:, :-1]
@@ -315,6 +336,12 @@ def best_step(bundle: Bundle, reduced: ReducedSystem, params: FloatArray, scale_
     return min(candidates, key=lambda one: cost(one, scale_px))
 
 
+def bundle_scale(bundle: Bundle) -> float:
+    """Return the `loss_scale` of a bundle."""
+    r = residuals(bundle)
+    return loss_scale(r, usable_mask(bundle, r))
+
+
 def cost(bundle: Bundle, scale_px: float) -> float:
     """Return half the sum of the loss of `reduce`; lost observations count with a residual of `lost_px`."""
     r = residuals(bundle)
@@ -325,7 +352,20 @@ def loss(r: FloatArray, usable: NDArray[np.bool_], scale_px: float) -> float:
     """Return half the sum of the loss of `reduce` over residuals (N, 2) in px^2; lost ones count `lost_px`."""
     with np.errstate(all="ignore"):
         squares = np.where(usable, np.einsum("ni,ni->n", r, r), REDUCTION.lost_px**2)
-    return float(scale_px**2 * np.sum(np.sqrt(1.0 + squares / scale_px**2) - 1.0))
+    return float(0.5 * scale_px**2 * np.sum(np.log1p(squares / scale_px**2)))
+
+
+def loss_scale(r: FloatArray, usable: NDArray[np.bool_]) -> float:
+    """Return the scale of the loss in pixels from the median of residuals (N, 2): outliers do not change it.
+
+    With normal noise, Cauchy's loss is then 95 % efficient (Holland and Welsch 1977).
+    """
+    lengths = np.linalg.norm(r[usable], axis=1)
+    noise = float(np.median(lengths)) / math.sqrt(2.0 * math.log(2.0)) if len(lengths) else 0.0
+    usual = REDUCTION.usual_count * REDUCTION.usual_noise_px**2
+    return REDUCTION.efficient_scale * math.sqrt(
+        (len(lengths) * noise**2 + usual) / (len(lengths) + REDUCTION.usual_count)
+    )
 
 
 def usable_mask(bundle: Bundle, r: FloatArray, depth: FloatArray | None = None) -> NDArray[np.bool_]:
@@ -353,5 +393,5 @@ def weigh(
         largest = np.maximum(np.abs(by_view).max(axis=(1, 2), initial=0.0), np.abs(by_point).max(axis=(1, 2)))
         used = usable & (largest < REDUCTION.max_derivative)
     r, by_view, by_point = (np.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in (r, by_view, by_point))
-    root = (1.0 + np.einsum("ni,ni->n", r, r) / scale_px**2) ** -0.25
+    root = (1.0 + np.einsum("ni,ni->n", r, r) / scale_px**2) ** -0.5
     return r * root[:, None], by_view * root[:, None, None], by_point * root[:, None, None], used

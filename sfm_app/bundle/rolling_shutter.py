@@ -5,7 +5,9 @@ determine it. Here every photo moves while it is read: along the path through it
 own, because a hand shakes between two photos. The usual size of offsets is estimated from the photos (MacKay 1992).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +25,7 @@ from sfm_app.bundle.normal_equations import (
     free_pose_columns,
     linearize,
     loss,
+    loss_scale,
     usable_mask,
 )
 from sfm_app.camera.projection import project_points
@@ -242,7 +245,8 @@ def _solve(
     rest = observed.r - observed.by_view @ views
     residue, influences = observed.drop_points(rest), observed.drop_points(observed.by_view @ influence)
     redundancy = max(2 * observed.used - int(np.sum(observed.rank)) - len(poses), 0) + REDUCTION.usual_count
-    noise2 = float((np.sum(residue**2) + REDUCTION.usual_count * REDUCTION.usual_noise_px**2) / redundancy)
+    squares = observed.inflation * np.sum(residue**2) + REDUCTION.usual_count * REDUCTION.usual_noise_px**2
+    noise2 = float(squares / redundancy)
     by_photo = np.bincount(bundle.photo, np.sum((influences * residue).reshape(-1, 2), axis=1))
     deviation = MISFIT * np.sqrt(max(noise2 * variances[n - BLOCK], float(np.sum(by_photo**2))))
     return ShutterStep(
@@ -269,10 +273,15 @@ def apply_shutter_step(model: ShutterBundle, step: ShutterStep, share: float) ->
 
 def shutter_cost(model: ShutterBundle, scale_px: float) -> float:
     """Return half the sum of the loss of `normal_equations.reduce`, in squared pixels."""
+    return loss(*_residuals(model), scale_px)
+
+
+def _residuals(model: ShutterBundle) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return observed less predicted positions (N, 2) in pixels, and the mask (N,) of the usable ones."""
     with np.errstate(all="ignore"):
         projected = project_rows(model.bundle, model.share, model.motion)
         r = model.bundle.x - projected.x
-    return loss(r, usable_mask(model.bundle, r, projected.depth), scale_px)
+    return r, usable_mask(model.bundle, r, projected.depth)
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,13 +344,12 @@ class _Problem:
     priors: LensPriors
     precision: FloatArray
     """(C, 12) of the priors on the cameras."""
-    scale_px: float
     held: bool
     """Whether the readout is known."""
 
 
 def estimate_readout(
-    bundle: Bundle, rows: Rows, priors: LensPriors, freed: NDArray[np.bool_], scale_px: float,
+    bundle: Bundle, rows: Rows, priors: LensPriors, freed: NDArray[np.bool_],
     start: ReadoutEstimate | None = None, *, known: float | None = None,
 ) -> ReadoutEstimate:  # fmt: skip
     """Adjust poses, points, cameras and the readout together; with a known readout, only poses and points.
@@ -350,19 +358,20 @@ def estimate_readout(
     the wide prior; `start` is an earlier estimate for the same photos.
     """
     fits = path_velocities(bundle.R, bundle.t, rows.times).select_most_predictive()
-    problem = _Problem(rows, fits, priors, priors.precision(freed), scale_px, known is not None)
+    problem = _Problem(rows, fits, priors, priors.precision(freed), known is not None)
     readout, shake = (start.readout, start.shake) if start else (0.0, np.ones(2))
     still = np.zeros((len(bundle.R), VELOCITY))
     model = ShutterBundle(bundle, rows.share, readout if known is None else known, still, still)
     model = _follow_path(model, problem)
     noise_px = REDUCTION.usual_noise_px
     for _ in range(OPTIONS.steps):
-        expected = _expected_offsets(model, problem, shake)
+        expected, scale_px = _expected_offsets(model, problem, shake), loss_scale(*_residuals(model))
         terms = _prior_terms(model, expected, problem, noise_px)
         step = shutter_step(model, *terms, scale_px, held=problem.held)
         noise_px = step.noise_px
-        before = _cost(model, expected, problem, noise_px)
-        model, after = _take_step(model, step, expected, problem, before)
+        costs = partial(_cost, expected=expected, problem=problem, noise_px=noise_px, scale_px=scale_px)
+        before = costs(model)
+        model, after = _take_step(model, step, problem, costs)
         last, shake = shake, _update_shake(model.offsets / expected, step.offset_variances / expected**2, shake)
         if after >= (1.0 - OPTIONS.converged) * before and np.abs(np.log(shake / last)).max() < np.log(
             OPTIONS.shake_converged
@@ -403,19 +412,20 @@ def _prior_terms(
 
 
 def _take_step(
-    model: ShutterBundle, step: ShutterStep, expected: FloatArray, problem: _Problem, before: float
+    model: ShutterBundle, step: ShutterStep, problem: _Problem, costs: Callable[[ShutterBundle], float]
 ) -> tuple[ShutterBundle, float]:
     """Return the model after the step, or after the part of it that lowers the cost, and its cost."""
+    before = costs(model)
     for k in range(OPTIONS.halvings + 1):
         candidate = _follow_path(apply_shutter_step(model, step, 0.5**k), problem)
-        after = _cost(candidate, expected, problem, step.noise_px)
+        after = costs(candidate)
         if after < before:
             return candidate, after
     return model, before
 
 
-def _cost(model: ShutterBundle, expected: FloatArray, problem: _Problem, noise_px: float) -> float:
+def _cost(model: ShutterBundle, expected: FloatArray, problem: _Problem, noise_px: float, scale_px: float) -> float:
     """Return half the sum of the loss and of the squares of the priors, in squared pixels."""
     offsets = problem.priors.prior_offsets(model.bundle.params)
     squares = np.sum((model.offsets / expected) ** 2) + np.sum(problem.precision * offsets**2)
-    return shutter_cost(model, problem.scale_px) + 0.5 * noise_px**2 * float(squares)
+    return shutter_cost(model, scale_px) + 0.5 * noise_px**2 * float(squares)

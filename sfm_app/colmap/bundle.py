@@ -32,7 +32,7 @@ from sfm_app.bundle.lens_parts import (
     fit_to_model,
     part_names,
 )
-from sfm_app.bundle.normal_equations import Bundle, best_step, cost, elimination_width, reduce
+from sfm_app.bundle.normal_equations import Bundle, best_step, bundle_scale, cost, elimination_width, reduce
 from sfm_app.camera.models import FILE_MODELS, INDEX, PARAMETERS, file_model, params_of_row, row_of_calibration
 from sfm_app.camera.rows import CX, CY, FISHEYE, FX, FY, PANORAMA, PERSPECTIVE
 from sfm_app.colmap.backend import all_cameras, all_points, pycolmap, run_in_daemon_thread, translate_errors
@@ -116,9 +116,6 @@ def photos_per_camera(model: pycolmap.Reconstruction) -> Counter[int]:
 
 logger = logging.getLogger("sfm_app")
 
-LOSS_SCALE_PX = 0.5
-"""Scale of COLMAP's SOFT_L1 loss: about twice the noise of SIFT keypoints. Poses are better than with COLMAP's 1."""
-
 
 @dataclass(frozen=True, slots=True)
 class AdjustmentOptions:
@@ -183,10 +180,11 @@ def adjust_in_rounds(
         ids, bundle = read_bundle(model, rules)
         if not (np.isfinite(bundle.params).all() and (bundle.params[:, [FX, FY]] > 0).all()):
             raise NumericalError("a camera has no focal length")
-        reduced = reduce(bundle, LOSS_SCALE_PX)
+        scale_px = bundle_scale(bundle)
+        reduced = reduce(bundle, scale_px)
         open_points.append(reduced.open_points)
         lenses = estimate_lenses(bundle.params, reduced, lens_priors(model, ids, bundle, rules))
-        write_bundle(model, ids, best_step(bundle, reduced, lenses.params, LOSS_SCALE_PX))
+        write_bundle(model, ids, best_step(bundle, reduced, lenses.params, scale_px))
         if lenses.step > OPTIONS.long_step:
             solve(model)
         changed = improve_tracks(model, graph) if graph else 0
@@ -201,8 +199,8 @@ def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None
     """Adjust poses, points and the focals of `refined` cameras in place, on one thread: sums over several vary."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.loss_function_scale = LOSS_SCALE_PX
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = bundle_scale(read_bundle(model)[1])
     options.ceres.solver_options.max_num_iterations = 50
     options.ceres.solver_options.function_tolerance = 1e-5
     options.ceres.solver_options.num_threads = 1
@@ -363,14 +361,15 @@ def _compare(
 ) -> tuple[tuple[float, LensChoice], ...]:
     """Return the evidence and the best model of a camera in two models with the same tracks."""
     read = [(model, *read_bundle(model, rules)) for model in (first, second)]
-    reduced = [reduce(bundle, LOSS_SCALE_PX) for _, _, bundle in read]
+    scale_px = min(bundle_scale(bundle) for _, _, bundle in read)
+    reduced = [reduce(bundle, scale_px) for _, _, bundle in read]
     noise_px = min(one.noise_px for one in reduced)
     compared = []
     for (model, ids, bundle), system in zip(read, reduced, strict=True):
         priors = lens_priors(model, ids, bundle, rules)
         ranking = estimate_lenses(bundle.params, replace(system, noise_px=noise_px), priors).ranking
         best = ranking[ids.index(camera_id)][0]
-        compared.append((family_evidence(cost(bundle, LOSS_SCALE_PX), noise_px, best), best))
+        compared.append((family_evidence(cost(bundle, scale_px), noise_px, best), best))
     return tuple(compared)
 
 

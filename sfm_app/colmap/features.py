@@ -7,6 +7,8 @@ output folder.
 """
 
 import contextlib
+import copy
+import math
 import secrets
 import shutil
 import sqlite3
@@ -16,7 +18,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -31,6 +35,8 @@ from sfm_app.progress import Progress, track
 from sfm_app.settings import MatchSettings
 from sfm_app.types import PairId
 
+GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+
 
 @dataclass(frozen=True, slots=True)
 class SiftSettings:
@@ -44,44 +50,46 @@ class SiftSettings:
     """Options of COLMAP's SIFT that differ from its defaults."""
 
 
-Extract = Callable[[Path, Sequence[str], pycolmap.FeatureExtractionOptions, pycolmap.CancellationToken], None]
-"""Lets COLMAP enter features of photos with these names in a database, which exists."""
+SiftFeatures: TypeAlias = tuple[NDArray[np.float64], NDArray[np.uint8]]
+"""Keypoints (N, 6) in pixels, with their shapes as in COLMAP's database, and descriptors (N, 128)."""
 
 
 def find_sift(database: Path, settings: SiftSettings, names: Sequence[str], workers: int, progress: Progress) -> None:
-    """Find features of photos that have none yet."""
+    """Find features of photos that have none yet.
+
+    COLMAP doubles the size of every photo before it looks for features. That takes three quarters of the time, and
+    gives the finest features, which are also the least exact ones. Without options, only photos with few features at
+    their own size are enlarged.
+    """
     extraction = _extraction_options(settings, workers)
     panoramas = panorama_names(database)
     extract_panoramas(database, settings, [name for name in names if name in panoramas], extraction, progress)
-    plain = [name for name in names if name not in panoramas]
-    reader = pycolmap.ImageReaderOptions()
-    if settings.masks is not None:
-        reader.mask_path = settings.masks
-
-    def extract(
-        target: Path,
-        chosen: Sequence[str],
-        options: pycolmap.FeatureExtractionOptions,
-        token: pycolmap.CancellationToken,
-    ) -> None:
-        pycolmap.extract_features(
-            target, settings.photos, list(chosen), reader_options=reader, extraction_options=options,
-            device=pycolmap.Device.cpu, cancellation_token=token,
-        )  # fmt: skip
+    with open_database(database) as reader:
+        ids = {image.name: image.image_id for image in reader.read_all_images() if image.name not in panoramas}
+        new = [name for name in names if name in ids and not reader.exists_keypoints(ids[name])]
+    as_needed = not settings.sift
+    most = settings.options.max_features if as_needed else None
+    if as_needed:
+        extraction.sift.first_octave = 0
+    batch = 4 * workers  # photos after which features are entered: what a killed run does again; chosen by hand
 
     def call(token: pycolmap.CancellationToken) -> None:
-        if settings.sift:
-            extract(database, plain, extraction, token)
-        else:
-            extract_as_needed(database, plain, extract, settings, workers, token)
+        for first in range(0, len(new), batch):
+            features = _extract(settings.photos, new[first : first + batch], extraction, token)
+            features = {name: _drop_masked(settings, name, found) for name, found in features.items()}
+            if as_needed:
+                features |= _find_enlarged(features, settings, extraction, token)
+            if token.is_cancelled:
+                return
+            with open_database(database) as target:
+                for name, found in sorted(features.items()):
+                    _write_features(target, ids[name], found, most)
 
-    if plain:
-        members = set(plain)
-        with open_database(database) as opened:
-            ids = [image.image_id for image in opened.read_all_images() if image.name in members]
-        _run_with_progress(
-            call, database, lambda one: sum(map(one.exists_keypoints, ids)), "features", len(ids), progress
-        )
+    def count(reader: pycolmap.Database) -> int:
+        return sum(reader.exists_keypoints(ids[name]) for name in new)
+
+    if new:
+        _run_with_progress(call, database, count, "features", len(new), progress)
 
 
 def _extraction_options(settings: SiftSettings, workers: int) -> pycolmap.FeatureExtractionOptions:
@@ -95,61 +103,90 @@ def _extraction_options(settings: SiftSettings, workers: int) -> pycolmap.Featur
     return extraction
 
 
-# Features of photos at their own size, and of enlarged ones where these are few.
-# COLMAP doubles the size of every photo before it looks for features. That takes three quarters of the time, and gives
-# the finest features, which are also the least exact ones. Photos with many features do as well without.
-
-
-def extract_as_needed(
-    database: Path,
-    names: Sequence[str],
-    extract: Extract,
+def _find_enlarged(
+    features: Mapping[str, SiftFeatures],
     settings: SiftSettings,
-    workers: int,
+    extraction: pycolmap.FeatureExtractionOptions,
     token: pycolmap.CancellationToken,
-) -> None:
-    """Enter SIFT features of photos that have none; those with few at their own size are enlarged. Ours."""
-    own_size, enlarged = _extraction_options(settings, workers), _extraction_options(settings, workers)
-    own_size.sift.first_octave = 0
-    with open_database(database) as before:
-        ids = {image.name: image.image_id for image in before.read_all_images()}
-        new = [name for name in names if not before.exists_keypoints(ids[name])]
-    batch = 16  # photos after which features are entered: what a killed run does again; chosen by hand
-    for first in range(0, len(new), batch):
-        some = new[first : first + batch]
-        with _empty_database() as scratch:
-            extract(scratch, some, own_size, token)
-            rich = _enter_rich(database, scratch, some, settings.options)
-        poor = [name for name in some if name not in rich]
-        if poor and not token.is_cancelled:
-            extract(database, poor, enlarged, token)
+) -> dict[str, SiftFeatures]:
+    """Return features of enlarged pictures of the photos that have few; photos that OpenCV cannot read are left out."""
+    options, pictures, scales = settings.options, dict[str, NDArray[np.uint8]](), dict[str, NDArray[np.float64]]()
+    few = {name: len(keypoints) for name, (keypoints, _) in features.items() if len(keypoints) < options.enlarge_below}
+    for name, count in sorted(few.items()):
+        photo = cv2.imdecode(np.fromfile(settings.photos / name, np.uint8), GRAY)
+        if photo is None:
+            continue
+        # the number of features grows with the area
+        factor = math.sqrt(2.0) if 2 * count >= options.enlarge_below else 2.0
+        factor *= min(1.0, options.max_image_size_px / max(photo.shape))
+        size = round(factor * photo.shape[1]), round(factor * photo.shape[0])
+        pictures[name] = cv2.resize(photo, size, interpolation=cv2.INTER_AREA if factor < 1.0 else cv2.INTER_CUBIC)
+        scales[name] = np.array([photo.shape[1] / size[0], photo.shape[0] / size[1]])
+    found = zip(pictures, _extract_pictures(list(pictures.values()), extraction, token), strict=False)
+    return {
+        name: _drop_masked(settings, name, (keypoints * scales[name][[0, 1, 0, 0, 1, 1]], descriptors))
+        for name, (keypoints, descriptors) in found
+    }
 
 
-@contextlib.contextmanager
-def _empty_database() -> Iterator[Path]:
-    """Provide a database in a folder of its own: COLMAP needs an existing file."""
+def _extract_pictures(
+    pictures: Sequence[NDArray[np.uint8]],
+    extraction: pycolmap.FeatureExtractionOptions,
+    token: pycolmap.CancellationToken,
+) -> list[SiftFeatures]:
+    """Return the SIFT features of pictures at their own size; none of any if `token` is cancelled meanwhile."""
+    own_size, names = copy.copy(extraction), [f"{number:03d}.png" for number in range(len(pictures))]
+    own_size.max_image_size = max((max(picture.shape) for picture in pictures), default=1)
     with tempfile.TemporaryDirectory(prefix="sfm-app-features-") as folder:
-        scratch = Path(folder) / "features.db"
-        with open_database(scratch):
-            pass
-        yield scratch
+        for name, picture in zip(names, pictures, strict=True):
+            Image.fromarray(picture).save(Path(folder) / name, compress_level=0)
+        features = _extract(Path(folder), names, own_size, token)
+    return [] if token.is_cancelled else [features[name] for name in names]
 
 
-def _enter_rich(database: Path, scratch: Path, names: Sequence[str], options: MatchSettings) -> set[str]:
-    """Enter the features of photos that have enough of them in another database, and return their names."""
-    with open_database(scratch) as source, open_database(database) as target:
-        of, to = ({image.name: image.image_id for image in one.read_all_images()} for one in (source, target))
-        found = [name for name in names if name in of]
-        rich = {name for name in found if source.num_keypoints_for_image(of[name]) >= options.enlarge_below}
-        for name in sorted(rich):
-            keypoints, descriptors = source.read_keypoints(of[name]), source.read_descriptors(of[name])
-            # COLMAP keeps whole octaves; here those of the largest scale remain, in their order
-            scale = np.hypot(keypoints[:, 2], keypoints[:, 4])
-            rows = np.sort(np.argsort(-scale, kind="stable")[: options.max_features])
-            data = np.ascontiguousarray(descriptors.data[rows])
-            target.write_keypoints(to[name], keypoints[rows])
-            target.write_descriptors(to[name], pycolmap.FeatureDescriptors(descriptors.type, data))
-    return rich
+def _extract(
+    folder: Path,
+    names: Sequence[str],
+    extraction: pycolmap.FeatureExtractionOptions,
+    token: pycolmap.CancellationToken,
+) -> dict[str, SiftFeatures]:
+    """Return the SIFT features of all files that COLMAP can read, by their names."""
+    with tempfile.TemporaryDirectory(prefix="sfm-app-features-") as scratch:
+        database = Path(scratch) / "features.db"
+        with open_database(database):
+            pass  # COLMAP needs an existing file
+        if names:
+            pycolmap.extract_features(
+                database, folder, list(names), extraction_options=extraction, device=pycolmap.Device.cpu,
+                cancellation_token=token,
+            )  # fmt: skip
+        with open_database(database) as source:
+            return {
+                image.name: (
+                    np.asarray(source.read_keypoints(image.image_id), np.float64).reshape(-1, 6),
+                    np.asarray(source.read_descriptors(image.image_id).data, np.uint8).reshape(-1, 128),
+                )
+                for image in source.read_all_images()
+            }
+
+
+def _drop_masked(settings: SiftSettings, name: str, features: SiftFeatures) -> SiftFeatures:
+    """Return the features that no mask hides."""
+    if settings.masks is None:
+        return features
+    used, (keypoints, descriptors) = read_mask(settings.masks, name), features
+    column, row = np.clip(keypoints[:, :2].astype(np.int64), 0, np.array(used.shape[::-1]) - 1).T
+    return keypoints[used[row, column]], descriptors[used[row, column]]
+
+
+def _write_features(target: pycolmap.Database, photo: int, features: SiftFeatures, most: int | None) -> None:
+    """Enter the `most` largest features of a photo in their order; COLMAP itself keeps whole octaves."""
+    keypoints, descriptors = features
+    areas = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
+    rows = np.sort(np.argsort(-areas, kind="stable")[:most])
+    target.write_keypoints(photo, np.ascontiguousarray(keypoints[rows], np.float32))
+    data = np.ascontiguousarray(descriptors[rows])
+    target.write_descriptors(photo, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, data))
 
 
 # Features of perspective views of panoramas, entered as keypoints of the panorama.
@@ -170,48 +207,24 @@ def extract_panoramas(
         images = {image.name: image.image_id for image in reader.read_all_images()}
         new = [name for name in names if not reader.exists_keypoints(images[name])]
     for name in track(progress, new, "panoramas", len(new)) if new else ():
-        keypoints, descriptors = _find_in_panorama(settings.photos / name, extraction)
-        if settings.masks is not None:
-            used = read_mask(settings.masks, name)
-            column, row = np.clip(keypoints[:, :2].astype(np.int64), 0, np.array(used.shape[::-1]) - 1).T
-            keypoints, descriptors = keypoints[used[row, column]], descriptors[used[row, column]]
-        best = np.argsort(-keypoints[:, 2], kind="stable")[: extraction.sift.max_num_features]
-        data = np.ascontiguousarray(descriptors[best])
+        found = _drop_masked(settings, name, _find_in_panorama(settings.photos / name, extraction))
         with open_database(database) as target:
-            target.write_keypoints(images[name], np.ascontiguousarray(keypoints[best, :2], np.float32))
-            target.write_descriptors(
-                images[name], pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, data)
-            )
+            _write_features(target, images[name], found, extraction.sift.max_num_features)
 
 
-def _find_in_panorama(
-    path: Path, extraction: pycolmap.FeatureExtractionOptions
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return keypoints (N, 3), x and y in pixels of the panorama and the scale in a view, and descriptors (N, 128)."""
+def _find_in_panorama(path: Path, extraction: pycolmap.FeatureExtractionOptions) -> SiftFeatures:
+    """Return features in pixels of the panorama, with their shapes in a view."""
     from sfm_app.photos.panoramas import PanoramaViews  # other processes of COLMAP need no compiler
 
     pixels = np.asarray(upright_image(read_picture(path)).convert("RGB"), np.uint8)
     views = PanoramaViews.cover((pixels.shape[1], pixels.shape[0]), extraction.max_image_size)
     pixels = views.shrink(pixels)
-    keypoints, descriptors = [np.zeros((0, 3))], [np.zeros((0, 128), np.uint8)]
-    with _empty_database() as scratch:
-        names = [f"{view:02d}.png" for view in range(len(views.rotations))]
-        for view, name in enumerate(names):
-            Image.fromarray(views.render(pixels, view)).save(scratch.parent / name, compress_level=1)
-        pycolmap.extract_features(
-            scratch, scratch.parent, names, extraction_options=extraction, device=pycolmap.Device.cpu
-        )
-        with open_database(scratch) as reader:
-            images = {image.name: image.image_id for image in reader.read_all_images()}
-            for view, name in enumerate(names):
-                points = np.asarray(reader.read_keypoints(images[name]), np.float64)
-                if not len(points):
-                    continue  # a clear sky
-                own = np.flatnonzero(views.is_nearest(points[:, :2], view))
-                scale = np.sqrt(np.abs(points[own, 2] * points[own, 5] - points[own, 3] * points[own, 4]))
-                keypoints.append(np.column_stack([views.to_panorama(points[own, :2], view), scale]))
-                descriptors.append(np.asarray(reader.read_descriptors(images[name]).data, np.uint8)[own])
-    return np.concatenate(keypoints), np.concatenate(descriptors)
+    pictures = [views.render(pixels, view) for view in range(len(views.rotations))]
+    parts: list[SiftFeatures] = [(np.zeros((0, 6)), np.zeros((0, 128), np.uint8))]
+    for view, (seen, descriptors) in enumerate(_extract_pictures(pictures, extraction, pycolmap.CancellationToken())):
+        own = np.flatnonzero(views.is_nearest(seen[:, :2], view))
+        parts.append((np.column_stack([views.to_panorama(seen[own, :2], view), seen[own, 2:]]), descriptors[own]))
+    return np.concatenate([keypoints for keypoints, _ in parts]), np.concatenate([values for _, values in parts])
 
 
 # Raw matches.

@@ -13,7 +13,7 @@ from sfm_app.bundle.normal_equations import Bundle
 from sfm_app.bundle.rolling_shutter import ReadoutEstimate, Rows, estimate_readout, move_to_middle_row
 from sfm_app.camera.projection import image_points
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.bundle import LOSS_SCALE_PX, Adjustment, lens_priors, read_bundle, write_bundle
+from sfm_app.colmap.bundle import Adjustment, lens_priors, read_bundle, write_bundle
 from sfm_app.colmap.model import posed_images, viewing_rays
 from sfm_app.types.arrays import FloatArray
 
@@ -52,7 +52,7 @@ def measure_readout(
         np.concatenate(tracked), bundle.family,
     )  # fmt: skip
     priors = lens_priors(model, ids, uncompensated)
-    return estimate_readout(uncompensated, rows, priors, np.array(freed), LOSS_SCALE_PX, start, known=known)
+    return estimate_readout(uncompensated, rows, priors, np.array(freed), start, known=known)
 
 
 def straighten_model(

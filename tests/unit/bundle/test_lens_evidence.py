@@ -7,7 +7,7 @@ import pytest
 
 from sfm_app.bundle.lens_evidence import estimate_lenses
 from sfm_app.bundle.lens_parts import PERSPECTIVE_PARTS, LensPriors
-from sfm_app.bundle.normal_equations import Bundle, project, reduce
+from sfm_app.bundle.normal_equations import Bundle, bundle_scale, project, reduce
 from sfm_app.camera.rows import CAMERA, PERSPECTIVE
 
 SIZE = np.array([1000.0, 800.0])
@@ -59,7 +59,7 @@ def asked(bundle, *cameras):
 
 def answer(bundle, *cameras):
     cameras = cameras or (True,) * len(bundle.params)
-    return estimate_lenses(bundle.params, reduce(bundle, 1.0), asked(bundle, *cameras))
+    return estimate_lenses(bundle.params, reduce(bundle, bundle_scale(bundle)), asked(bundle, *cameras))
 
 
 def freed(found, camera=0):

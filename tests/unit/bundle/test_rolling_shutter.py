@@ -245,7 +245,7 @@ def ignore_shutter(bundle):
 
 def measure(frames, **how):
     bundle = ignore_shutter(frames.bundle)
-    return estimate_readout(bundle, frames.rows, priors(bundle), ALL, SCALE_PX, **how)
+    return estimate_readout(bundle, frames.rows, priors(bundle), ALL, **how)
 
 
 @pytest.mark.slow
@@ -277,9 +277,9 @@ def test_straight_on_with_parallel_views_tells_nothing():
 def test_poses_are_those_of_the_middle_rows():
     bent = film(0.03, frames=20, swing_deg_s=60.0)
     true, ignored = bent.bundle, ignore_shutter(bent.bundle)
-    found = estimate_readout(ignored, bent.rows, priors(ignored), ALL, SCALE_PX)
+    found = estimate_readout(ignored, bent.rows, priors(ignored), ALL)
     errors = [np.median(turn_errors_deg(one.R, true.R)) for one in (ignored, found.bundle)]
-    assert errors[0] > 0.2 and errors[1] < 0.25 * errors[0]
+    assert errors[0] > 0.15 and errors[1] < 0.25 * errors[0]
 
 
 def turn_errors_deg(R, S):
@@ -299,7 +299,7 @@ def test_a_known_readout_is_kept():
 def test_an_earlier_estimate_shortens_the_way():
     walk = film(0.02, frames=12, swing_deg_s=60.0)
     first = measure(walk)
-    again = estimate_readout(first.bundle, walk.rows, priors(first.bundle), ALL, SCALE_PX, first)
+    again = estimate_readout(first.bundle, walk.rows, priors(first.bundle), ALL, first)
     assert again.readout == pytest.approx(first.readout, abs=0.3 * first.deviation)
 
 
@@ -309,5 +309,5 @@ def test_points_far_off_do_not_stop_it():
     away = np.zeros_like(walk.bundle.X)
     away[:5] = 1e9
     bundle = apply_step(walk.bundle, walk.bundle.params, np.zeros((12, 6)), away)
-    found = estimate_readout(bundle, walk.rows, priors(bundle), ALL, SCALE_PX)
+    found = estimate_readout(bundle, walk.rows, priors(bundle), ALL)
     assert found.readout == pytest.approx(0.02, rel=0.15)

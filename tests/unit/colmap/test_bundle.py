@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from sfm_app.bundle.lens_parts import CameraRule
-from sfm_app.bundle.normal_equations import reduce
+from sfm_app.bundle.normal_equations import bundle_scale, reduce
 from sfm_app.camera.models import calibration_from_model, camera_matrix
 from sfm_app.camera.rows import CAMERA, FISHEYE, FX, K1, K2, K3, P1, PANORAMA
 from sfm_app.colmap import bundle
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle import (
-    LOSS_SCALE_PX,
     adjust,
     adjust_or_keep,
     read_bundle,
@@ -80,7 +79,7 @@ def test_the_covariance_of_the_cameras_is_that_of_colmap(mapped):
         camera.model, camera.params = pycolmap.CameraModelId.OPENCV, PLAIN
     solve(model)
     ids, bundle = read_bundle(model)
-    H = reduce(bundle, LOSS_SCALE_PX).H
+    H = reduce(bundle, bundle_scale(bundle)).H
     own = [CAMERA * camera + place for camera in range(2) for place in range(8)]
     ours = np.linalg.inv(H[np.ix_(own, own)])
 
@@ -93,8 +92,8 @@ def test_the_covariance_of_the_cameras_is_that_of_colmap(mapped):
 def colmap_covariances(model, ids):
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary, options.refine_principal_point = False, True
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.loss_function_scale = LOSS_SCALE_PX
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = bundle_scale(read_bundle(model)[1])
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
