@@ -35,6 +35,8 @@ from sfm_app.progress import Progress, track
 from sfm_app.settings import MatchSettings
 from sfm_app.types import PairId
 
+Size: TypeAlias = tuple[int, int]
+"""Width and height in pixels."""
 GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 
 
@@ -67,18 +69,21 @@ def find_sift(database: Path, settings: SiftSettings, names: Sequence[str], work
     with open_database(database) as reader:
         ids = {image.name: image.image_id for image in reader.read_all_images() if image.name not in panoramas}
         new = [name for name in names if name in ids and not reader.exists_keypoints(ids[name])]
-    as_needed = not settings.sift
-    most = settings.options.max_features if as_needed else None
-    if as_needed:
+        cameras = {camera.camera_id: (camera.width, camera.height) for camera in reader.read_all_cameras()}
+        sizes = {image.name: cameras[image.camera_id] for image in reader.read_all_images()}
+    enlarge_below, most = 0, None
+    if not settings.sift:
         extraction.sift.first_octave = 0
+        enlarge_below, most = settings.options.enlarge_below, settings.options.max_features
     batch = 4 * workers  # photos after which features are entered: what a killed run does again; chosen by hand
 
     def call(token: pycolmap.CancellationToken) -> None:
         for first in range(0, len(new), batch):
-            features = _extract(settings.photos, new[first : first + batch], extraction, token)
-            features = {name: _drop_masked(settings, name, found) for name, found in features.items()}
-            if as_needed:
-                features |= _find_enlarged(features, settings, extraction, token)
+            some = {name: sizes[name] for name in new[first : first + batch]}
+            features = _drop_masked(_extract(settings.photos, some, extraction, token), settings.masks)
+            few = {name: len(found[0]) for name, found in features.items() if len(found[0]) < enlarge_below}
+            enlarged = _find_enlarged(few, sizes, settings, extraction, token)
+            features |= _drop_masked(enlarged, settings.masks)
             if token.is_cancelled:
                 return
             with open_database(database) as target:
@@ -104,79 +109,90 @@ def _extraction_options(settings: SiftSettings, workers: int) -> pycolmap.Featur
 
 
 def _find_enlarged(
-    features: Mapping[str, SiftFeatures],
+    few: Mapping[str, int],
+    sizes: Mapping[str, Size],
     settings: SiftSettings,
     extraction: pycolmap.FeatureExtractionOptions,
     token: pycolmap.CancellationToken,
 ) -> dict[str, SiftFeatures]:
-    """Return features of enlarged pictures of the photos that have few; photos that OpenCV cannot read are left out."""
+    """Return features of photos that have `few` at their own size from enlarged ones: they grow with the area.
+
+    Photos with half of `enlarge_below` or more get twice the area, the others twice the size. Photos that OpenCV cannot
+    read are left out.
+    """
     options, pictures, scales = settings.options, dict[str, NDArray[np.uint8]](), dict[str, NDArray[np.float64]]()
-    few = {name: len(keypoints) for name, (keypoints, _) in features.items() if len(keypoints) < options.enlarge_below}
-    for name, count in sorted(few.items()):
+    doubled, enough = copy.deepcopy(extraction), math.ceil(options.enlarge_below / 2)
+    doubled.sift.first_octave = -1
+    found = _extract(
+        settings.photos, {name: sizes[name] for name, count in few.items() if count < enough}, doubled, token
+    )
+    for name in sorted(few.keys() - found.keys()):
         photo = cv2.imdecode(np.fromfile(settings.photos / name, np.uint8), GRAY)
         if photo is None:
             continue
-        # the number of features grows with the area
-        factor = math.sqrt(2.0) if 2 * count >= options.enlarge_below else 2.0
-        factor *= min(1.0, options.max_image_size_px / max(photo.shape))
+        factor = math.sqrt(2.0) * min(1.0, options.max_image_size_px / max(photo.shape))
         size = round(factor * photo.shape[1]), round(factor * photo.shape[0])
         pictures[name] = cv2.resize(photo, size, interpolation=cv2.INTER_AREA if factor < 1.0 else cv2.INTER_CUBIC)
-        scales[name] = np.array([photo.shape[1] / size[0], photo.shape[0] / size[1]])
-    found = zip(pictures, _extract_pictures(list(pictures.values()), extraction, token), strict=False)
-    return {
-        name: _drop_masked(settings, name, (keypoints * scales[name][[0, 1, 0, 0, 1, 1]], descriptors))
-        for name, (keypoints, descriptors) in found
-    }
+        scales[name] = np.array([photo.shape[1] / size[0], photo.shape[0] / size[1]])[[0, 1, 0, 0, 1, 1]]
+    for name, (keypoints, values) in _extract_pictures(pictures, extraction, token).items():
+        found[name] = keypoints * scales[name], values
+    return found
 
 
 def _extract_pictures(
-    pictures: Sequence[NDArray[np.uint8]],
+    pictures: Mapping[str, NDArray[np.uint8]],
     extraction: pycolmap.FeatureExtractionOptions,
     token: pycolmap.CancellationToken,
-) -> list[SiftFeatures]:
-    """Return the SIFT features of pictures at their own size; none of any if `token` is cancelled meanwhile."""
-    own_size, names = copy.copy(extraction), [f"{number:03d}.png" for number in range(len(pictures))]
-    own_size.max_image_size = max((max(picture.shape) for picture in pictures), default=1)
+) -> dict[str, SiftFeatures]:
+    """Return the SIFT features of pictures at their own size."""
+    own_size, files = copy.copy(extraction), {f"{number:03d}.png": name for number, name in enumerate(pictures)}
+    own_size.max_image_size = max((max(picture.shape) for picture in pictures.values()), default=1)
     with tempfile.TemporaryDirectory(prefix="sfm-app-features-") as folder:
-        for name, picture in zip(names, pictures, strict=True):
-            Image.fromarray(picture).save(Path(folder) / name, compress_level=0)
-        features = _extract(Path(folder), names, own_size, token)
-    return [] if token.is_cancelled else [features[name] for name in names]
+        for file, name in files.items():
+            Image.fromarray(pictures[name]).save(Path(folder) / file, compress_level=0)
+        sizes = {file: pictures[name].shape[1::-1] for file, name in files.items()}
+        found = _extract(Path(folder), sizes, own_size, token)
+    return {files[file]: features for file, features in found.items()}
 
 
 def _extract(
     folder: Path,
-    names: Sequence[str],
+    sizes: Mapping[str, Size],
     extraction: pycolmap.FeatureExtractionOptions,
     token: pycolmap.CancellationToken,
 ) -> dict[str, SiftFeatures]:
-    """Return the SIFT features of all files that COLMAP can read, by their names."""
+    """Return the SIFT features of files by their names, of those that COLMAP can read and that have these sizes."""
     with tempfile.TemporaryDirectory(prefix="sfm-app-features-") as scratch:
         database = Path(scratch) / "features.db"
         with open_database(database):
             pass  # COLMAP needs an existing file
-        if names:
+        if sizes:
             pycolmap.extract_features(
-                database, folder, list(names), extraction_options=extraction, device=pycolmap.Device.cpu,
+                database, folder, list(sizes), extraction_options=extraction, device=pycolmap.Device.cpu,
                 cancellation_token=token,
             )  # fmt: skip
         with open_database(database) as source:
+            read = {camera.camera_id: (camera.width, camera.height) for camera in source.read_all_cameras()}
             return {
                 image.name: (
                     np.asarray(source.read_keypoints(image.image_id), np.float64).reshape(-1, 6),
                     np.asarray(source.read_descriptors(image.image_id).data, np.uint8).reshape(-1, 128),
                 )
                 for image in source.read_all_images()
+                if read[image.camera_id] == sizes[image.name]
             }
 
 
-def _drop_masked(settings: SiftSettings, name: str, features: SiftFeatures) -> SiftFeatures:
-    """Return the features that no mask hides."""
-    if settings.masks is None:
-        return features
-    used, (keypoints, descriptors) = read_mask(settings.masks, name), features
-    column, row = np.clip(keypoints[:, :2].astype(np.int64), 0, np.array(used.shape[::-1]) - 1).T
-    return keypoints[used[row, column]], descriptors[used[row, column]]
+def _drop_masked(features: Mapping[str, SiftFeatures], masks: Path | None) -> dict[str, SiftFeatures]:
+    """Return the features of photos that no mask hides."""
+    if masks is None:
+        return dict(features)
+    kept = {}
+    for name, (keypoints, values) in features.items():
+        used = read_mask(masks, name)
+        column, row = np.clip(keypoints[:, :2].astype(np.int64), 0, np.array(used.shape[::-1]) - 1).T
+        kept[name] = keypoints[used[row, column]], values[used[row, column]]
+    return kept
 
 
 def _write_features(target: pycolmap.Database, photo: int, features: SiftFeatures, most: int | None) -> None:
@@ -207,9 +223,9 @@ def extract_panoramas(
         images = {image.name: image.image_id for image in reader.read_all_images()}
         new = [name for name in names if not reader.exists_keypoints(images[name])]
     for name in track(progress, new, "panoramas", len(new)) if new else ():
-        found = _drop_masked(settings, name, _find_in_panorama(settings.photos / name, extraction))
+        found = _drop_masked({name: _find_in_panorama(settings.photos / name, extraction)}, settings.masks)
         with open_database(database) as target:
-            _write_features(target, images[name], found, extraction.sift.max_num_features)
+            _write_features(target, images[name], found[name], extraction.sift.max_num_features)
 
 
 def _find_in_panorama(path: Path, extraction: pycolmap.FeatureExtractionOptions) -> SiftFeatures:
@@ -219,11 +235,12 @@ def _find_in_panorama(path: Path, extraction: pycolmap.FeatureExtractionOptions)
     pixels = np.asarray(upright_image(read_picture(path)).convert("RGB"), np.uint8)
     views = PanoramaViews.cover((pixels.shape[1], pixels.shape[0]), extraction.max_image_size)
     pixels = views.shrink(pixels)
-    pictures = [views.render(pixels, view) for view in range(len(views.rotations))]
+    pictures = {str(view): views.render(pixels, view) for view in range(len(views.rotations))}
     parts: list[SiftFeatures] = [(np.zeros((0, 6)), np.zeros((0, 128), np.uint8))]
-    for view, (seen, descriptors) in enumerate(_extract_pictures(pictures, extraction, pycolmap.CancellationToken())):
-        own = np.flatnonzero(views.is_nearest(seen[:, :2], view))
-        parts.append((np.column_stack([views.to_panorama(seen[own, :2], view), seen[own, 2:]]), descriptors[own]))
+    for view, (seen, values) in sorted(_extract_pictures(pictures, extraction, pycolmap.CancellationToken()).items()):
+        own = np.flatnonzero(views.is_nearest(seen[:, :2], int(view)))
+        x = views.to_panorama(seen[own, :2], int(view))
+        parts.append((np.column_stack([x, seen[own, 2:]]), values[own]))
     return np.concatenate([keypoints for keypoints, _ in parts]), np.concatenate([values for _, values in parts])
 
 
