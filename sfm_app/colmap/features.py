@@ -31,13 +31,12 @@ from sfm_app.colmap.worker_process import ProcessGroup, ProgressReporter, SiftOp
 from sfm_app.files import replace_atomically
 from sfm_app.photos.decode import read_picture, upright_image
 from sfm_app.photos.masks import read_mask
-from sfm_app.progress import Progress, track
+from sfm_app.progress import Progress
 from sfm_app.settings import MatchSettings
 from sfm_app.types import PairId
 
 Size: TypeAlias = tuple[int, int]
 """Width and height in pixels."""
-GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,32 +62,29 @@ def find_sift(database: Path, settings: SiftSettings, names: Sequence[str], work
     gives the finest features, which are also the least exact ones. Without options, only photos with few features at
     their own size are enlarged.
     """
-    extraction = _extraction_options(settings, workers)
-    panoramas = panorama_names(database)
-    extract_panoramas(database, settings, [name for name in names if name in panoramas], extraction, progress)
+    extraction, panoramas = _extraction_options(settings, workers), panorama_names(database)
     with open_database(database) as reader:
-        ids = {image.name: image.image_id for image in reader.read_all_images() if image.name not in panoramas}
-        new = [name for name in names if name in ids and not reader.exists_keypoints(ids[name])]
+        ids = {image.name: image.image_id for image in reader.read_all_images()}
         cameras = {camera.camera_id: (camera.width, camera.height) for camera in reader.read_all_cameras()}
         sizes = {image.name: cameras[image.camera_id] for image in reader.read_all_images()}
-    enlarge_below, most = 0, None
-    if not settings.sift:
-        extraction.sift.first_octave = 0
-        enlarge_below, most = settings.options.enlarge_below, settings.options.max_features
+        new = [name for name in names if not reader.exists_keypoints(ids[name])]
     batch = 4 * workers  # photos after which features are entered: what a killed run does again; chosen by hand
 
     def call(token: pycolmap.CancellationToken) -> None:
         for first in range(0, len(new), batch):
             some = {name: sizes[name] for name in new[first : first + batch]}
-            features = _drop_masked(_extract(settings.photos, some, extraction, token), settings.masks)
-            few = {name: len(found[0]) for name, found in features.items() if len(found[0]) < enlarge_below}
-            enlarged = _find_enlarged(few, sizes, settings, extraction, token)
-            features |= _drop_masked(enlarged, settings.masks)
+            features = _find_in_photos(
+                {name: some[name] for name in some.keys() - panoramas}, settings, extraction, token
+            )
+            for name in some.keys() & panoramas:
+                features[name] = _find_in_panorama(name, settings, extraction, token)
             if token.is_cancelled:
                 return
             with open_database(database) as target:
-                for name, found in sorted(features.items()):
-                    _write_features(target, ids[name], found, most)
+                for name, (keypoints, values) in sorted(features.items()):
+                    target.write_keypoints(ids[name], np.ascontiguousarray(keypoints, np.float32))
+                    descriptors = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, values)
+                    target.write_descriptors(ids[name], descriptors)
 
     def count(reader: pycolmap.Database) -> int:
         return sum(reader.exists_keypoints(ids[name]) for name in new)
@@ -103,40 +99,51 @@ def _extraction_options(settings: SiftSettings, workers: int) -> pycolmap.Featur
     extraction.num_threads = workers
     extraction.use_gpu = False
     extraction.sift.max_num_features = settings.options.max_features
+    extraction.sift.first_octave = -1 if settings.sift else 0
     for name, value in settings.sift.items():
         setattr(extraction.sift, name, value)
     return extraction
 
 
-def _find_enlarged(
-    few: Mapping[str, int],
+def _find_in_photos(
     sizes: Mapping[str, Size],
     settings: SiftSettings,
     extraction: pycolmap.FeatureExtractionOptions,
     token: pycolmap.CancellationToken,
 ) -> dict[str, SiftFeatures]:
-    """Return features of photos that have `few` at their own size from enlarged ones: they grow with the area.
+    """Return the features of photos by name.
 
-    Photos with half of `enlarge_below` or more get twice the area, the others twice the size. Photos that OpenCV cannot
-    read are left out.
+    The number of features grows with the area. Photos with half of `enlarge_below` or more get twice the area, those
+    with fewer twice the size.
     """
-    options, pictures, scales = settings.options, dict[str, NDArray[np.uint8]](), dict[str, NDArray[np.float64]]()
-    doubled, enough = copy.deepcopy(extraction), math.ceil(options.enlarge_below / 2)
+    options, masks = settings.options, settings.masks
+    features = _drop_masked(_extract(settings.photos, sizes, extraction, token), masks)
+    if settings.sift:
+        return features
+    few = {name: len(found[0]) for name, found in features.items() if len(found[0]) < options.enlarge_below}
+    enough, doubled = math.ceil(options.enlarge_below / 2), copy.deepcopy(extraction)
     doubled.sift.first_octave = -1
-    found = _extract(
-        settings.photos, {name: sizes[name] for name, count in few.items() if count < enough}, doubled, token
-    )
-    for name in sorted(few.keys() - found.keys()):
-        photo = cv2.imdecode(np.fromfile(settings.photos / name, np.uint8), GRAY)
-        if photo is None:
-            continue
-        factor = math.sqrt(2.0) * min(1.0, options.max_image_size_px / max(photo.shape))
-        size = round(factor * photo.shape[1]), round(factor * photo.shape[0])
-        pictures[name] = cv2.resize(photo, size, interpolation=cv2.INTER_AREA if factor < 1.0 else cv2.INTER_CUBIC)
-        scales[name] = np.array([photo.shape[1] / size[0], photo.shape[0] / size[1]])[[0, 1, 0, 0, 1, 1]]
+    poor = {name: sizes[name] for name, count in few.items() if count < enough}
+    features |= _drop_masked(_extract(settings.photos, poor, doubled, token), masks)
+    enlarged = ((name, _enlarge(settings.photos / name, options)) for name in sorted(few.keys() - poor.keys()))
+    pictures = {name: picture for name, picture in enlarged if picture is not None}
     for name, (keypoints, values) in _extract_pictures(pictures, extraction, token).items():
-        found[name] = keypoints * scales[name], values
-    return found
+        scale = np.array(sizes[name]) / pictures[name].shape[1::-1]
+        features[name] = keypoints * scale[[0, 1, 0, 0, 1, 1]], values
+    features = _drop_masked(features, masks)
+    return {name: _largest(found, options.max_features) for name, found in features.items()}
+
+
+def _enlarge(path: Path, options: MatchSettings) -> NDArray[np.uint8] | None:
+    """Return a photo (H, W) with twice the area at which features are found; None if OpenCV cannot read it."""
+    photo = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if photo is None:
+        return None
+    factor = math.sqrt(2.0) * min(1.0, options.max_image_size_px / max(photo.shape))
+    size = round(factor * photo.shape[1]), round(factor * photo.shape[0])
+    return np.asarray(
+        cv2.resize(photo, size, interpolation=cv2.INTER_AREA if factor < 1.0 else cv2.INTER_CUBIC), np.uint8
+    )
 
 
 def _extract_pictures(
@@ -195,53 +202,34 @@ def _drop_masked(features: Mapping[str, SiftFeatures], masks: Path | None) -> di
     return kept
 
 
-def _write_features(target: pycolmap.Database, photo: int, features: SiftFeatures, most: int | None) -> None:
-    """Enter the `most` largest features of a photo in their order; COLMAP itself keeps whole octaves."""
-    keypoints, descriptors = features
+def _largest(features: SiftFeatures, most: int) -> SiftFeatures:
+    """Return the `most` largest features in their order; COLMAP itself keeps whole octaves."""
+    keypoints, values = features
     areas = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
     rows = np.sort(np.argsort(-areas, kind="stable")[:most])
-    target.write_keypoints(photo, np.ascontiguousarray(keypoints[rows], np.float32))
-    data = np.ascontiguousarray(descriptors[rows])
-    target.write_descriptors(photo, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, data))
+    return keypoints[rows], np.ascontiguousarray(values[rows])
 
 
-# Features of perspective views of panoramas, entered as keypoints of the panorama.
-
-
-def extract_panoramas(
-    database: Path,
+def _find_in_panorama(
+    name: str,
     settings: SiftSettings,
-    names: Sequence[str],
     extraction: pycolmap.FeatureExtractionOptions,
-    progress: Progress,
-) -> None:
-    """Find SIFT features of panoramas that have none yet. Ours.
-
-    Of too many features, those of the largest scale remain, as in COLMAP, whose largest size is that of one view.
-    """
-    with open_database(database) as reader:
-        images = {image.name: image.image_id for image in reader.read_all_images()}
-        new = [name for name in names if not reader.exists_keypoints(images[name])]
-    for name in track(progress, new, "panoramas", len(new)) if new else ():
-        found = _drop_masked({name: _find_in_panorama(settings.photos / name, extraction)}, settings.masks)
-        with open_database(database) as target:
-            _write_features(target, images[name], found[name], extraction.sift.max_num_features)
-
-
-def _find_in_panorama(path: Path, extraction: pycolmap.FeatureExtractionOptions) -> SiftFeatures:
-    """Return features in pixels of the panorama, with their shapes in a view."""
+    token: pycolmap.CancellationToken,
+) -> SiftFeatures:
+    """Return features of perspective views of a panorama, in its pixels, with their shapes in a view."""
     from sfm_app.photos.panoramas import PanoramaViews  # other processes of COLMAP need no compiler
 
-    pixels = np.asarray(upright_image(read_picture(path)).convert("RGB"), np.uint8)
+    pixels = np.asarray(upright_image(read_picture(settings.photos / name)).convert("RGB"), np.uint8)
     views = PanoramaViews.cover((pixels.shape[1], pixels.shape[0]), extraction.max_image_size)
     pixels = views.shrink(pixels)
     pictures = {str(view): views.render(pixels, view) for view in range(len(views.rotations))}
     parts: list[SiftFeatures] = [(np.zeros((0, 6)), np.zeros((0, 128), np.uint8))]
-    for view, (seen, values) in sorted(_extract_pictures(pictures, extraction, pycolmap.CancellationToken()).items()):
+    for view, (seen, values) in sorted(_extract_pictures(pictures, extraction, token).items()):
         own = np.flatnonzero(views.is_nearest(seen[:, :2], int(view)))
         x = views.to_panorama(seen[own, :2], int(view))
         parts.append((np.column_stack([x, seen[own, 2:]]), values[own]))
-    return np.concatenate([keypoints for keypoints, _ in parts]), np.concatenate([values for _, values in parts])
+    found = np.concatenate([keypoints for keypoints, _ in parts]), np.concatenate([values for _, values in parts])
+    return _largest(_drop_masked({name: found}, settings.masks)[name], settings.options.max_features)
 
 
 # Raw matches.

@@ -191,8 +191,8 @@ def _mixed_padded_groups(whole: Sequence[CalibratedCamera], pairs: PhotoPairs, s
 def _calibrate_from_all_pairs(
     cameras: Sequence[CalibratedCamera], pairs: PhotoPairs, options: CalibrationSettings
 ) -> list[CalibratedCamera]:
-    """Return all cameras calibrated jointly from all pairs; a single camera stays as it is."""
-    if len(cameras) <= 1:
+    """Return all cameras calibrated jointly from all pairs; a single camera, or cameras without pairs, stay."""
+    if len(cameras) <= 1 or not pairs.photos:
         return list(cameras)
     number = {photo: k for k, camera in enumerate(cameras) for photo in camera.photos}
     everything = CameraPairs(pairs.Fs, pairs.weights, (1, 1), pairs.photos, pairs.inliers)

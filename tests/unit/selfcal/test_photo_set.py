@@ -50,6 +50,14 @@ def test_photos_without_pairs_have_the_usual_guess(count, together):
     assert camera.found.focal_px == pytest.approx(1200)
 
 
+def test_two_cameras_without_pairs_have_the_usual_guess_too():
+    cameras = cameras_of(replace(alone(4), groups=dict(enumerate("aabb"))))
+    assert [(one.name, one.photos, one.found.method) for one in cameras] == [
+        ("a", (0, 1), "guess"),
+        ("b", (2, 3), "guess"),
+    ]
+
+
 @pytest.mark.parametrize("together", [True, False])
 def test_a_claim_comes_before_a_guess(together):
     (camera,) = cameras_of(alone(4, hints={1: 900.0, 2: 910.0, 3: 5000.0}), together)
