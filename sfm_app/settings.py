@@ -157,8 +157,7 @@ class SceneSettings(Section):
     """Poses, sparse points and bundle adjustment."""
 
     mapper: Literal["auto", "incremental", "global"] = Field(
-        "auto",
-        description="incremental: photo after photo from a seed; global: all at once; auto: the better of both",
+        "auto", description="incremental: photo after photo from a seed; global: all at once; auto: the better of both"
     )
     camera_model: CameraModelName = Field(
         "auto",

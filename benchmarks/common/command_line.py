@@ -31,9 +31,7 @@ def new_parser(subject: str, text: str | None) -> argparse.ArgumentParser:
         text: its help, printed verbatim.
     """
     return argparse.ArgumentParser(
-        prog=f"python -m benchmarks.{subject}",
-        description=text,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        prog=f"python -m benchmarks.{subject}", description=text, formatter_class=argparse.RawDescriptionHelpFormatter
     )
 
 

@@ -9,13 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.synthetic.shapes import (
-    Body,
-    Color,
-    Material,
-    Pattern,
-    Shape,
-)
+from sfm_app.synthetic.shapes import Body, Color, Material, Pattern, Shape
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]

@@ -30,18 +30,7 @@ from sfm_app.synthetic.scenes import (
     statue,
     statue_views,
 )
-from sfm_app.synthetic.shapes import (
-    Body,
-    Color,
-    Material,
-    Shape,
-    SyntheticScene,
-    ball,
-    box,
-    ground,
-    revolve,
-    torus,
-)
+from sfm_app.synthetic.shapes import Body, Color, Material, Shape, SyntheticScene, ball, box, ground, revolve, torus
 
 ASHLAR = Material(
     pattern="brick", base=(204, 190, 160), second=(178, 160, 128), joint=(112, 100, 82), scale=0.34, contrast=0.5
@@ -142,10 +131,7 @@ def _pane(x: float, bottom: float, top: float, curtain: int) -> list[Body]:
         box(OPENING, 0.07, 0.08).move((x, top - 0.07, z)),
         box(OPENING, 0.05, 0.08).move((x, bottom + 0.62 * high, z)),
     ]
-    bodies = [
-        Body(box(OPENING, high, 0.02).move((x, bottom, z - 0.02)), GLASS),
-        Body(assemble(bars), FRAME),
-    ]
+    bodies = [Body(box(OPENING, high, 0.02).move((x, bottom, z - 0.02)), GLASS), Body(assemble(bars), FRAME)]
     if curtain:
         width = 0.2 + 0.09 * curtain
         bodies.append(
@@ -307,11 +293,7 @@ def _shelf() -> list[Body]:
             book = box(deep, high, thick, spacing=0.05).move((0.03 + deep / 2, y, z + thick / 2))
             bodies.append(Body(book, cover))
             z += thick + 0.002
-    return [
-        *bodies,
-        Body(ball(0.12).move((0.16, 1.37, 2.0)), MARBLE),
-        Body(_vase(0.6).move((0.15, 1.25, 2.45)), PAINT),
-    ]
+    return [*bodies, Body(ball(0.12).move((0.16, 1.37, 2.0)), MARBLE), Body(_vase(0.6).move((0.15, 1.25, 2.45)), PAINT)]
 
 
 def _pictures() -> list[Body]:

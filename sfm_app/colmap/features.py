@@ -35,6 +35,8 @@ from sfm_app.progress import Progress
 from sfm_app.settings import MatchSettings
 from sfm_app.types import PairId
 
+Token: TypeAlias = pycolmap.CancellationToken
+Extraction: TypeAlias = pycolmap.FeatureExtractionOptions
 Size: TypeAlias = tuple[int, int]
 """Width and height in pixels."""
 
@@ -70,7 +72,7 @@ def find_sift(database: Path, settings: SiftSettings, names: Sequence[str], work
         new = [name for name in names if not reader.exists_keypoints(ids[name])]
     batch = 4 * workers  # photos after which features are entered: what a killed run does again; chosen by hand
 
-    def call(token: pycolmap.CancellationToken) -> None:
+    def call(token: Token) -> None:
         for first in range(0, len(new), batch):
             some = {name: sizes[name] for name in new[first : first + batch]}
             features = _find_in_photos(
@@ -93,7 +95,7 @@ def find_sift(database: Path, settings: SiftSettings, names: Sequence[str], work
         _run_with_progress(call, database, count, "features", len(new), progress)
 
 
-def _extraction_options(settings: SiftSettings, workers: int) -> pycolmap.FeatureExtractionOptions:
+def _extraction_options(settings: SiftSettings, workers: int) -> Extraction:
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = settings.options.max_image_size_px
     extraction.num_threads = workers
@@ -106,10 +108,7 @@ def _extraction_options(settings: SiftSettings, workers: int) -> pycolmap.Featur
 
 
 def _find_in_photos(
-    sizes: Mapping[str, Size],
-    settings: SiftSettings,
-    extraction: pycolmap.FeatureExtractionOptions,
-    token: pycolmap.CancellationToken,
+    sizes: Mapping[str, Size], settings: SiftSettings, extraction: Extraction, token: Token
 ) -> dict[str, SiftFeatures]:
     """Return the features of photos by name.
 
@@ -147,9 +146,7 @@ def _enlarge(path: Path, options: MatchSettings) -> NDArray[np.uint8] | None:
 
 
 def _extract_pictures(
-    pictures: Mapping[str, NDArray[np.uint8]],
-    extraction: pycolmap.FeatureExtractionOptions,
-    token: pycolmap.CancellationToken,
+    pictures: Mapping[str, NDArray[np.uint8]], extraction: Extraction, token: Token
 ) -> dict[str, SiftFeatures]:
     """Return the SIFT features of pictures at their own size."""
     own_size, files = copy.copy(extraction), {f"{number:03d}.png": name for number, name in enumerate(pictures)}
@@ -162,12 +159,7 @@ def _extract_pictures(
     return {files[file]: features for file, features in found.items()}
 
 
-def _extract(
-    folder: Path,
-    sizes: Mapping[str, Size],
-    extraction: pycolmap.FeatureExtractionOptions,
-    token: pycolmap.CancellationToken,
-) -> dict[str, SiftFeatures]:
+def _extract(folder: Path, sizes: Mapping[str, Size], extraction: Extraction, token: Token) -> dict[str, SiftFeatures]:
     """Return the SIFT features of files by their names, of those that COLMAP can read and that have these sizes."""
     with tempfile.TemporaryDirectory(prefix="sfm-app-features-") as scratch:
         database = Path(scratch) / "features.db"
@@ -210,12 +202,7 @@ def _largest(features: SiftFeatures, most: int) -> SiftFeatures:
     return keypoints[rows], np.ascontiguousarray(values[rows])
 
 
-def _find_in_panorama(
-    name: str,
-    settings: SiftSettings,
-    extraction: pycolmap.FeatureExtractionOptions,
-    token: pycolmap.CancellationToken,
-) -> SiftFeatures:
+def _find_in_panorama(name: str, settings: SiftSettings, extraction: Extraction, token: Token) -> SiftFeatures:
     """Return features of perspective views of a panorama, in its pixels, with their shapes in a view."""
     from sfm_app.photos.panoramas import PanoramaViews  # other processes of COLMAP need no compiler
 
@@ -250,7 +237,7 @@ def match_sift(database: Path, options: MatchSettings, pairs: Sequence[PairId], 
             image.name = str(image.image_id)
             target.update_image(image)
 
-    def call(token: pycolmap.CancellationToken) -> None:
+    def call(token: Token) -> None:
         pycolmap.match_image_pairs(
             database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu,
             cancellation_token=token,

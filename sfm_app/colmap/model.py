@@ -107,9 +107,7 @@ def posed_photo_ids(model: pycolmap.Reconstruction) -> list[int]:
     return [image.image_id for image in posed_images(model)]
 
 
-def cameras_by_photo(
-    model: pycolmap.Reconstruction,
-) -> dict[int, tuple[NDArray[np.float64], tuple[float, ...]]]:
+def cameras_by_photo(model: pycolmap.Reconstruction) -> dict[int, tuple[NDArray[np.float64], tuple[float, ...]]]:
     """Return K (3, 3) and `Calibration.distortion` of every posed photo, by id: k1; of a fisheye, all radial terms."""
     return {image.image_id: _matrix_and_terms(model.cameras[image.camera_id]) for image in posed_images(model)}
 

@@ -233,11 +233,7 @@ def fit_surfaces(
 
 
 def depth_height_correlation(
-    up: FloatArray,
-    rotations: FloatArray,
-    centers: FloatArray,
-    points: FloatArray,
-    visible: Sequence[NDArray[np.int64]],
+    up: FloatArray, rotations: FloatArray, centers: FloatArray, points: FloatArray, visible: Sequence[NDArray[np.int64]]
 ) -> float:
     """Return the mean correlation of log depth with height in the photo, in [-1, 1].
 

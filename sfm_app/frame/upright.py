@@ -67,11 +67,7 @@ def orient_or_keep(
         return orient(model, matches, cues, turn_deg)
     except FAILURES as err:
         logger.info("the model cannot be oriented", exc_info=err)
-        return {
-            "failed": error_reason(err),
-            "unit": "that of mapping",
-            "gps": "not used: the up direction is unknown",
-        }
+        return {"failed": error_reason(err), "unit": "that of mapping", "gps": "not used: the up direction is unknown"}
 
 
 def orient(

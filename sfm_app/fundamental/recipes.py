@@ -36,10 +36,7 @@ def median_sigma(squared: FloatArray) -> float:
 
 RANSAC = Recipe(score=ransac, finish=refit_sampson)
 LEV_RANSAC = replace(
-    RANSAC,
-    score=msac_linear,
-    validity=partial(prior_validity, sigma_from_inliers=False),
-    stop_on_convergence=True,
+    RANSAC, score=msac_linear, validity=partial(prior_validity, sigma_from_inliers=False), stop_on_convergence=True
 )
 
 RECIPES: Mapping[str, tuple[Recipe, str]] = {

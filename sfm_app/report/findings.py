@@ -14,13 +14,7 @@ from PIL import Image
 from sfm_app.camera.models import PARAMETERS
 from sfm_app.colmap.model import ModelFigures
 from sfm_app.report.contents import RunContents, data_address
-from sfm_app.report.text import (
-    SOURCES,
-    WARNING,
-    duration_text,
-    intrinsics_lines,
-    result_lines,
-)
+from sfm_app.report.text import SOURCES, WARNING, duration_text, intrinsics_lines, result_lines
 from sfm_app.runtime.workspace import model_triangles
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraModel, Photo

@@ -46,10 +46,7 @@ CALIBRATORS: dict[str, tuple[CalibrateFunction, str]] = {
         least_squares.calibrate,
         "least squares with equal weights for all pairs, the thesis's non-robust benchmark",
     ),
-    kruppa.METHOD: (
-        kruppa.calibrate,
-        "least squares over the Kruppa equations, from their focal-only solution",
-    ),
+    kruppa.METHOD: (kruppa.calibrate, "least squares over the Kruppa equations, from their focal-only solution"),
 }
 """Every calibrator by name, with a line about it."""
 

@@ -8,14 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.stereo.patch_match import (
-    NO_MATCH,
-    fit_planes,
-    improve_planes,
-    plane_normals,
-    remove_spill,
-    rim_mask,
-)
+from sfm_app.stereo.patch_match import NO_MATCH, fit_planes, improve_planes, plane_normals, remove_spill, rim_mask
 from sfm_app.stereo.plain_areas import enclosed_pixels, fill_planar_areas, plain_walls, surfaceless_areas
 from sfm_app.stereo.rectify import depths_from_disparities, disparities, rectify
 from sfm_app.stereo.view import DepthEstimate, DepthMap, GrayImage, View
@@ -101,12 +94,7 @@ def merge_hypotheses(depths: NDArray[np.float32], parallaxes: NDArray[np.float32
 
 
 @kernel
-def _merge(
-    depths: NDArray[np.float32],
-    parallaxes: NDArray[np.float32],
-    tolerance: float,
-    depth: DepthArray,
-) -> None:
+def _merge(depths: NDArray[np.float32], parallaxes: NDArray[np.float32], tolerance: float, depth: DepthArray) -> None:
     count, height, width = depths.shape
     for row in range(height):
         for col in range(width):

@@ -99,12 +99,7 @@ def outlier_mask(sightings: Sightings, gains: FloatArray, neighbors: IntArray) -
 
 @kernel
 def _measure_deviations(
-    here: IndexArray,
-    colors: NDArray[np.uint8],
-    photo: IntArray,
-    scale: FloatArray,
-    level: FloatArray,
-    far: FloatArray,
+    here: IndexArray, colors: NDArray[np.uint8], photo: IntArray, scale: FloatArray, level: FloatArray, far: FloatArray
 ) -> None:
     """Write the largest deviations `far` of the views `here` from their median color; `level` is a buffer."""
     count = len(here)
@@ -268,12 +263,7 @@ def _log_gains(logs: FloatArray, photo: IndexArray, starts: IndexArray, photos: 
 
 @kernel
 def _add_equations(
-    logs: FloatArray,
-    photo: IndexArray,
-    starts: IndexArray,
-    gains: FloatArray,
-    normal: FloatArray,
-    right: FloatArray,
+    logs: FloatArray, photo: IndexArray, starts: IndexArray, gains: FloatArray, normal: FloatArray, right: FloatArray
 ) -> None:
     """Add the normal equations of the gains at the current weights, with the color of each triangle eliminated."""
     weight, level = np.empty(len(right)), np.empty(len(right))

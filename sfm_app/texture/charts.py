@@ -159,12 +159,7 @@ def _project_corners(
 
 @kernel
 def _absorb(
-    sizes: IndexArray,
-    starts: IndexArray,
-    order: IntArray,
-    views: Views,
-    neighbors: IntArray,
-    chosen: IntArray,
+    sizes: IndexArray, starts: IndexArray, order: IntArray, views: Views, neighbors: IntArray, chosen: IntArray
 ) -> int:
     """Give small components the neighboring photo with the longest common border; return how many changed."""
     absorbed = 0

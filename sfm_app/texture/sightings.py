@@ -261,11 +261,7 @@ def _measure(
 
 @kernel
 def _drop_masked(
-    camera: FloatArray,
-    masked: NDArray[np.int32],
-    vertices: FloatArray,
-    faces: IndexArray,
-    score: NDArray[np.float32],
+    camera: FloatArray, masked: NDArray[np.int32], vertices: FloatArray, faces: IndexArray, score: NDArray[np.float32]
 ) -> None:
     """Set the score of triangles with a masked pixel to 0; `masked` is the integral image (height + 1, width + 1)."""
     corner = np.empty((3, 2))

@@ -11,13 +11,7 @@ from sfm_app.camera.models import calibration_from_model, camera_matrix
 from sfm_app.camera.rows import CAMERA, FISHEYE, FX, K1, K2, K3, P1, PANORAMA
 from sfm_app.colmap import bundle
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.bundle import (
-    adjust,
-    adjust_or_keep,
-    read_bundle,
-    solve,
-    write_camera,
-)
+from sfm_app.colmap.bundle import adjust, adjust_or_keep, read_bundle, solve, write_camera
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import camera_family, read_camera
 from sfm_app.errors import BackendError, NumericalError
@@ -267,8 +261,7 @@ def test_what_photos_do_not_determine_stays_as_it_was_given(mapped):
 
 
 @pytest.mark.parametrize(
-    ("name", "free"),
-    [("PINHOLE", ("aspect",)), ("RADIAL", ("k1", "k2")), ("OPENCV", ("aspect", "k1", "k2", "p1 p2"))],
+    ("name", "free"), [("PINHOLE", ("aspect",)), ("RADIAL", ("k1", "k2")), ("OPENCV", ("aspect", "k1", "k2", "p1 p2"))]
 )
 def test_the_model_that_the_user_names_is_the_one_that_is_fitted(mapped, name, free):
     model, database = mapped([900.0, 903.0, *TRUE[2:6], 0.004, -0.004], start=(893.0, 500.0, 400.0, -0.08))

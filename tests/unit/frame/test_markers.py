@@ -143,11 +143,7 @@ def test_markers_do_not_touch_each_other_or_the_margin(paper, side):
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"side_m": 0.5}, "no marker of 50 cm fits"),
-        ({"first": 5000}, "or none has number 5000"),
-    ],
+    ("change", "says"), [({"side_m": 0.5}, "no marker of 50 cm fits"), ({"first": 5000}, "or none has number 5000")]
 )
 def test_what_does_not_fit_is_said(tmp_path, change, says):
     with pytest.raises(ConfigError, match=says):

@@ -403,15 +403,7 @@ def try_out(run, cameras):
     """
 
     def make(
-        grown,
-        at_once=None,
-        count=COUNT,
-        points=500,
-        contradicted=0,
-        completed=0,
-        settled=False,
-        guess=False,
-        **scene,
+        grown, at_once=None, count=COUNT, points=500, contradicted=0, completed=0, settled=False, guess=False, **scene
     ):
         images = {key: MatchedImage(key, f"{key}.jpg", "one", 1024, 768) for key in range(1, count + 1)}
         rng = np.random.default_rng(0)

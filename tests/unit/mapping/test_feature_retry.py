@@ -15,13 +15,7 @@ from sfm_app.errors import BackendError, ClusterError
 from sfm_app.estimation import calibrating
 from sfm_app.mapping import feature_retry
 from sfm_app.mapping.attempt import Attempt, explained_pairs
-from sfm_app.mapping.feature_retry import (
-    OPTIONS,
-    add_matches,
-    candidate_pairs,
-    find_finer_evidence,
-    lost_photos,
-)
+from sfm_app.mapping.feature_retry import OPTIONS, add_matches, candidate_pairs, find_finer_evidence, lost_photos
 from sfm_app.mapping.passes import Outcome
 from sfm_app.settings import Settings
 from sfm_app.types import Evidence, MatchedImage, MatchGraph, ViewGraph

@@ -5,16 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from sfm_app.meshing.visibility import (
-    CONFIRMED,
-    EMPTY,
-    NO_EVIDENCE,
-    SEEN_THROUGH,
-    SKY,
-    Paint,
-    judge,
-    sample_colors,
-)
+from sfm_app.meshing.visibility import CONFIRMED, EMPTY, NO_EVIDENCE, SEEN_THROUGH, SKY, Paint, judge, sample_colors
 from sfm_app.types import PosedPhoto
 
 FACING = np.array([[0.0, 0.0, -1.0]])

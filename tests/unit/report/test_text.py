@@ -8,14 +8,7 @@ import pytest
 
 from sfm_app.camera.bearings import field_of_view_deg
 from sfm_app.camera.models import camera_matrix
-from sfm_app.report.text import (
-    camera_texts,
-    field_text,
-    held_text,
-    lens_text,
-    scene_lines,
-    scene_summary,
-)
+from sfm_app.report.text import camera_texts, field_text, held_text, lens_text, scene_lines, scene_summary
 from sfm_app.settings import HYPOTHESES, HypothesisName
 from sfm_app.types import Calibration, CameraModel, Scene
 

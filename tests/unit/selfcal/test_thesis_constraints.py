@@ -23,12 +23,7 @@ from sfm_app.selfcal.thesis.verdict import CameraParameters
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import CameraPairs
 
-FORMS = {
-    "(5.8)": huang_faugeras,
-    "(5.9)": frobenius_form,
-    "(5.11)": trivedi,
-    "(5.25)": polynomial_form,
-}
+FORMS = {"(5.8)": huang_faugeras, "(5.9)": frobenius_form, "(5.11)": trivedi, "(5.25)": polynomial_form}
 seeds = st.integers(0, 2**32 - 1)
 
 

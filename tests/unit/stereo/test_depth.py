@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_app.stereo import DepthEstimate, DepthMap, confirm_depths, match_depths, rank_neighbors
-from sfm_app.stereo.depth import (
-    OPTIONS,
-    count_maps,
-    filter_speckles,
-    merge_hypotheses,
-)
+from sfm_app.stereo.depth import OPTIONS, count_maps, filter_speckles, merge_hypotheses
 from sfm_app.types import Rejected
 
 slow = pytest.mark.slow

@@ -5,14 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.stereo.rectify import (
-    DISPARITY_STEP,
-    OPTIONS,
-    Rectification,
-    depths_from_disparities,
-    disparities,
-    rectify,
-)
+from sfm_app.stereo.rectify import DISPARITY_STEP, OPTIONS, Rectification, depths_from_disparities, disparities, rectify
 from sfm_app.stereo.view import View
 from sfm_app.types import Rejected
 

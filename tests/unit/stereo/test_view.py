@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.stereo.view import (
-    BEST_ANGLE_DEG,
-    View,
-    point_weights,
-    rank_neighbors,
-    region,
-)
+from sfm_app.stereo.view import BEST_ANGLE_DEG, View, point_weights, rank_neighbors, region
 
 
 def view_at(center, points, ids=None, focal=500.0) -> View:

@@ -8,13 +8,7 @@ from PIL import Image
 
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.synthetic.cameras import Camera, Lens, Views, make_camera
-from sfm_app.synthetic.photo_folder import (
-    PhotoOptions,
-    develop,
-    load_truth,
-    save_truth,
-    write_photo_folder,
-)
+from sfm_app.synthetic.photo_folder import PhotoOptions, develop, load_truth, save_truth, write_photo_folder
 
 pytestmark = pytest.mark.slow
 
