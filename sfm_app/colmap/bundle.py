@@ -137,8 +137,8 @@ class AdjustmentOptions:
     min_point_share: float = 0.1
     """Smallest share of the points after an adjustment; one that drops more has diverged. Chosen by hand."""
     long_step: float = 1.0
-    """Step of the cameras, in standard deviations, above which COLMAP's solver refines poses and points: the linear
-    step is then too inaccurate. Chosen by hand."""
+    """Step of the cameras, in standard deviations, above which COLMAP's solver refines poses and points, as it does where
+    the linear step would raise the cost. Chosen by hand."""
     most_tied: int = 250
     """Photos that a photo is tied to (`elimination_width`) above which COLMAP's solver takes conjugate gradients. Where
     all see the same, a factorization grows with the cube of the photos; along streets it is five times as fast.
@@ -184,13 +184,15 @@ def adjust_in_rounds(
         reduced = reduce(bundle, scale_px)
         open_points.append(reduced.open_points)
         lenses = estimate_lenses(bundle.params, reduced, lens_priors(model, ids, bundle, rules))
-        write_bundle(model, ids, best_step(bundle, reduced, lenses.params, scale_px))
-        if lenses.step > OPTIONS.long_step:
+        moved = best_step(bundle, reduced, lenses.params, scale_px)
+        write_bundle(model, ids, moved)
+        is_refused = np.array_equal(moved.t, bundle.t)
+        if is_refused or lenses.step > OPTIONS.long_step:
             solve(model)
         changed = improve_tracks(model, graph) if graph else 0
         if model.num_points3D() <= OPTIONS.min_point_share * points:
             raise NumericalError(f"only {model.num_points3D()} of {points} points remain")
-        if lenses.step < OPTIONS.settled_step and changed < OPTIONS.changed_share * len(bundle.x):
+        if not is_refused and lenses.step < OPTIONS.settled_step and changed < OPTIONS.changed_share * len(bundle.x):
             break
     return Rounds(ids, bundle, lenses, reduced.noise_px, open_points[0])
 

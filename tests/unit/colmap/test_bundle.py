@@ -51,6 +51,20 @@ def test_squeezed_photos_have_two_focals_others_one(mapped):
     assert found[:2] == pytest.approx([900, 1200], rel=0.003)
 
 
+def turn_photos(model):
+    for key, image in model.images.items():
+        pose = image.cam_from_world()
+        pose.rotation = pycolmap.Rotation3d(np.array([key, 1.0, -key, 2.0]) / np.hypot(np.sqrt(2) * key, np.sqrt(5)))
+        model.frames[image.frame_id].set_cam_from_world(image.camera_id, pose)
+
+
+def test_poses_too_far_off_for_a_linear_step_are_adjusted_all_the_same(mapped):
+    model, database = mapped()
+    best = adjust(model, database).model.compute_mean_reprojection_error()
+    turn_photos(model)
+    assert adjust(model, database).model.compute_mean_reprojection_error() < 1.2 * best
+
+
 def test_the_camera_with_most_photos_does_not_free_one_of_a_single_photo(mapped):
     model, database = mapped(photos=5, cameras=2, start=(890.0, 500.0, 400.0, 0.0))
     lone, *others = sorted(image_id for image_id in model.reg_image_ids() if model.images[image_id].camera_id == 2)
@@ -335,10 +349,9 @@ def test_photos_from_one_place_leave_numbers_or_the_model_as_it_was(mapped):
 
 def test_a_model_that_loses_its_points_stays_as_mapping_left_it(mapped):
     model, database = mapped()
-    for key, image in model.images.items():
-        pose = image.cam_from_world()
-        pose.rotation = pycolmap.Rotation3d(np.array([key, 1.0, -key, 2.0]) / np.hypot(np.sqrt(2) * key, np.sqrt(5)))
-        model.frames[image.frame_id].set_cam_from_world(image.camera_id, pose)
+    turn_photos(model)
+    for point in model.points3D.values():
+        point.xyz = np.random.default_rng(point.track.length()).normal(size=3)
 
     with pytest.raises(NumericalError, match=r"only \d+ of \d+ points remain"):
         adjust(model, database)
