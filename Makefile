@@ -11,7 +11,7 @@ test quick faults: export OPENBLAS_NUM_THREADS = 1
 # not learned: its PyTorch brings gigabytes
 PLUGINS := $(filter-out plugins/learned,$(wildcard plugins/*))
 
-.PHONY: demo test quick learned faults lint format viewers docs wheels test-pythons clean
+.PHONY: demo test quick learned faults bench-rivals lint format viewers docs wheels test-pythons clean
 
 demo: $(INSTALLED)
 	$(BIN)/sfm-app demo -o demo
@@ -32,6 +32,15 @@ learned: $(INSTALLED)
 # kill -9, Ctrl-C, full disks and more at many points of a run
 faults: $(INSTALLED)
 	SFM_APP_FAULTS=1 $(BIN)/python -m pytest -n $(JOBS) tests/faults
+
+# rivals that registries have, beside ours on the same pixels, for two hours: DATA has pairs/*.npz, NAME/images and NAME/cameras.json
+bench-rivals: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
+	$(BIN)/python -m benchmarks.cameras $(DATA) --cache $(CACHE) --results $(CACHE) --told 10 5 0 --openmvg \
+	    --sets Herz-Jesus-P8 fountain-P11 castle-P19 'fountain-P11 crop:460,200' 'castle-P19 scale:0.75,1'
+	$(BIN)/python -m benchmarks.fundamental --real $(DATA) --facades 5 --cache $(CACHE) --results $(CACHE) \
+	    --methods lev-ransac --rivals 'OpenCV MAGSAC++' SupeRANSAC openmvg-rs
+	$(BIN)/python -m benchmarks.selfcal --photos $(DATA) --cache $(CACHE) --results $(CACHE)
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

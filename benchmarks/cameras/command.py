@@ -16,7 +16,15 @@ from pathlib import Path
 
 from benchmarks.cameras.bars import BARS
 from benchmarks.cameras.measure import OWN_CAMERA_SETS, measure, warm_up
-from benchmarks.cameras.methods import STOCK, Method, group_by_size, methods, rotate_methods, told_methods
+from benchmarks.cameras.methods import (
+    STOCK,
+    Method,
+    group_by_size,
+    methods,
+    openmvg_methods,
+    rotate_methods,
+    told_methods,
+)
 from benchmarks.cameras.report import draw, medians, page
 from benchmarks.cameras.score import true_photos
 from benchmarks.common.command_line import add_pictures, add_results, is_wanted, new_parser, overrides
@@ -51,7 +59,7 @@ def run_all(args: argparse.Namespace, these: Sequence[Method], cache: Path) -> I
     sets = list(chosen_sets(args, cache))
     warm_up([photos for photos, _ in sets], these, cache / "cameras" / "warm-up")
     for photos, name in sets:
-        of_set = [*these, *told_to_stock(args, photos, name)]
+        of_set = [*these, *told_to_rivals(args, photos, name)]
         for repetition in range(max(args.repeat, 1 + args.twice)):
             for method in rotate_methods(of_set, repetition):
                 if method.kind in STOCK and repetition >= args.repeat:
@@ -62,11 +70,14 @@ def run_all(args: argparse.Namespace, these: Sequence[Method], cache: Path) -> I
                 yield row | {"repetition": repetition}
 
 
-def told_to_stock(args: argparse.Namespace, photos: PhotoSet, name: str) -> list[Method]:
-    """Return stock with what it is told of the camera, on a set whose photos share a size and a true camera."""
+def told_to_rivals(args: argparse.Namespace, photos: PhotoSet, name: str) -> list[Method]:
+    """Return rivals with what they are told of the camera, on a set whose photos share a size and a true camera."""
     truth = true_photos(args.data / name / "cameras.json", steps(photos.name.partition(" ")[2])).values()
     cameras, sizes = {photo.K.tobytes(): photo.K for photo in truth}, list(group_by_size(photos.folder))
-    return told_methods(next(iter(cameras.values())), sizes[0], args.told) if len(cameras) == len(sizes) == 1 else []
+    if len(cameras) != 1 or len(sizes) != 1:
+        return []
+    K = next(iter(cameras.values()))
+    return told_methods(K, sizes[0], args.told) + (openmvg_methods(K) if args.openmvg else [])
 
 
 def parser() -> argparse.ArgumentParser:
@@ -87,6 +98,7 @@ def parser() -> argparse.ArgumentParser:
         "--told", nargs="*", type=float, default=[], metavar="PERCENT",
         help="stock told of a focal that is so far off, too; with 0, of the true K",
     )  # fmt: skip
+    parser.add_argument("--openmvg", action="store_true", help="openmvg-rs without and with the true K, too")
     parser.add_argument("--repeat", type=int, default=1, metavar="N", help="runs of every method")
     parser.add_argument("--twice", action="store_true", help="run ours at least twice and compare the bytes")
     add_results(parser, "cameras")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from benchmarks.cameras.worker import GLOBAL, INCREMENTAL, OURS, RESULT
+from benchmarks.cameras.worker import GLOBAL, INCREMENTAL, OPENMVG, OURS, RESULT
 from benchmarks.common.photo_sets import PhotoSet, link_or_copy
 from benchmarks.common.processes import module_command, run_command
 from benchmarks.common.results import Row
@@ -28,9 +28,9 @@ class Method:
 
     name: str
     kind: str = OURS
-    """`OURS`, or one of `STOCK`."""
+    """`OURS`, `OPENMVG`, or one of `STOCK`."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the program that differ from its defaults; of stock, camera_model and camera_params if it is told."""
+    """Settings of the program that differ from its defaults; what another one is told of the camera."""
     without: str = ""
     """Hypothesis about the photos that is switched off; such a run resumes a finished one at its scene."""
 
@@ -69,6 +69,12 @@ def told_methods(K: NDArray[np.float64], size: tuple[int, int], errors: Sequence
     return stated
 
 
+def openmvg_methods(K: NDArray[np.float64]) -> list[Method]:
+    """List openmvg-rs without and with the true K, whose first pixel has its center at (0, 0) there."""
+    told = K - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+    return [Method(OPENMVG, OPENMVG), Method(f"{OPENMVG}, told: true K", OPENMVG, {"K": told.tolist()})]
+
+
 def rotate_methods(these: Sequence[Method], repetition: int) -> list[Method]:
     """Start every repetition with another method, so that none always meets a cold or a busy machine."""
     first = repetition % len(these)
@@ -86,10 +92,11 @@ def run(method: Method, photos: PhotoSet, out: Path, limit_s: float | None = Non
     if finished is not None:
         shutil.copytree(finished, out, symlinks=True)
     ours = method.settings if method.kind == OURS else {}
-    settings = merge_nested({"photos": {"cameras": photos.cameras if photos.cameras_given else "auto"}}, ours)
+    usual = {"report": False, "photos": {"cameras": photos.cameras if photos.cameras_given else "auto"}}
+    settings = merge_nested(usual, ours)  # no rival writes a report
     cap = MatchSettings(**settings.get("matching", {})).max_image_size_px
     options = {"settings": settings, "cameras": photos.cameras, "max_image_size_px": cap}
-    if method.kind in STOCK:
+    if method.kind != OURS:
         options |= method.settings
     folder = photos.folder
     if method.kind in STOCK and photos.cameras != "each" and len(sizes := group_by_size(folder)) > 1:

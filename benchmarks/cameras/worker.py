@@ -7,14 +7,15 @@ import json
 import sys
 import time
 import zlib  # before pycolmap, see docs/libraries/pycolmap.md
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from benchmarks.common.memory import cpu_seconds, peak_mb
 
 OURS = "sfm-app"
-INCREMENTAL, GLOBAL = "incremental", "global"
+INCREMENTAL, GLOBAL, OPENMVG = "incremental", "global", "openmvg-rs"
 RESULT = "benchmark.json"
 """File in OUT with the process's own report."""
 MODES = {"each": "AUTO", "folder": "PER_FOLDER"}
@@ -79,15 +80,33 @@ def run_stock(photos: Path, out: Path, options: Mapping[str, Any], mapper: str) 
     return {"failed": "", "exit code": 0, "seconds": seconds, "peak MB": peak_mb()}
 
 
+def run_openmvg(photos: Path, out: Path, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Run openmvg-rs with its defaults; it guesses the camera where the options have no K."""
+    from benchmarks.common.command_line import import_rival
+
+    openmvg, file, start = import_rival("openmvg_rs"), None, time.perf_counter()
+    out.mkdir()
+    if "K" in options:
+        file = out / "K.txt"
+        file.write_text("\n".join(" ".join(map(str, row)) for row in options["K"]), encoding="ascii")
+    try:
+        scene = openmvg.reconstruct(str(photos), intrinsics=file and str(file), progress=False)
+    except openmvg.OpenMVGError as error:
+        return {"failed": str(error), "exit code": 1, "seconds": {}, "peak MB": peak_mb()}
+    scene.write_colmap(str(out / "text"))
+    return {"failed": "", "exit code": 0, "seconds": {"map": time.perf_counter() - start}, "peak MB": peak_mb()}
+
+
 def main() -> None:
     kind, photos, out, text = sys.argv[1:]
-    options = json.loads(text)
-    found = (
-        run_ours(Path(photos), Path(out), options)
-        if kind == OURS
-        else run_stock(Path(photos), Path(out), options, kind)
-    )
+    make: Callable[[Path, Path, Mapping[str, Any]], dict[str, Any]] = partial(run_stock, mapper=kind)
+    found = {OURS: run_ours, OPENMVG: run_openmvg}.get(kind, make)(Path(photos), Path(out), json.loads(text))
     found["CPU seconds"] = cpu_seconds()
+    if kind == OPENMVG and not found["failed"]:
+        import pycolmap  # imported late: its cost is not the method's
+
+        (Path(out) / "sparse").mkdir()
+        pycolmap.Reconstruction(Path(out) / "text" / "sparse" / "0").write(Path(out) / "sparse")
     (Path(out) / RESULT).write_text(json.dumps(found), encoding="utf-8")
 
 

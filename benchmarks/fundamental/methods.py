@@ -20,9 +20,9 @@ FloatArray = NDArray[np.float64]
 
 BASELINE = "OpenCV MAGSAC++"
 """The rival that times are divided by."""
-RIVALS = ("OpenCV RANSAC", BASELINE, "PoseLib", "pycolmap LO-RANSAC", "SupeRANSAC")
-QUICK = RIVALS[:-1]
-"""Rivals that run unless others are named: SupeRANSAC takes seconds for a pair with many outliers."""
+RIVALS = ("OpenCV RANSAC", BASELINE, "PoseLib", "pycolmap LO-RANSAC", "SupeRANSAC", "openmvg-rs")
+QUICK = RIVALS[:-2]
+"""Rivals that run unless others are named: the others are in the extra `bench`, and SupeRANSAC takes seconds."""
 
 
 def our_estimators(names: Sequence[str], options: EpipolarSettings) -> dict[str, Method]:
@@ -46,7 +46,7 @@ def _our_estimator(name: str, options: EpipolarSettings) -> Method:
 def rivals(names: Sequence[str], options: EpipolarSettings) -> dict[str, Method]:
     """Return rivals by name, with our threshold, confidence and limit; what they return is not judged any further."""
     cv2.setNumThreads(1)
-    makers = (_opencv(cv2.FM_RANSAC), _opencv(cv2.USAC_MAGSAC), _poselib, _pycolmap, _superansac)
+    makers = (_opencv(cv2.FM_RANSAC), _opencv(cv2.USAC_MAGSAC), _poselib, _pycolmap, _superansac, _openmvg)
     return {name: make(options) for name, make in zip(RIVALS, makers, strict=True) if name in names}
 
 
@@ -95,5 +95,17 @@ def _superansac(options: EpipolarSettings) -> Method:
         sizes = [float(one[:, axis].max()) + 1.0 for one in (x1, x2) for axis in (0, 1)]
         F = np.asarray(pysuperansac.estimateFundamentalMatrix(np.hstack([x1, x2]), sizes, [], settings)[0])
         return (F if F.shape == (3, 3) else None), None
+
+    return fit
+
+
+def _openmvg(options: EpipolarSettings) -> Method:
+    openmvg = import_rival("openmvg_rs")
+
+    def fit(x1: FloatArray, x2: FloatArray, seed: int) -> tuple[FloatArray | None, int | None]:
+        try:
+            return openmvg.estimate_fundamental(x1, x2, threshold=options.max_error_px, seed=seed).matrix, None
+        except openmvg.EstimationError:
+            return None, None
 
     return fit
