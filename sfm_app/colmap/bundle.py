@@ -137,8 +137,8 @@ class AdjustmentOptions:
     min_point_share: float = 0.1
     """Smallest share of the points after an adjustment; one that drops more has diverged. Chosen by hand."""
     long_step: float = 1.0
-    """Step of the cameras, in standard deviations, above which COLMAP's solver refines poses and points, as it does where
-    the linear step would raise the cost. Chosen by hand."""
+    """Step of the cameras, in standard deviations, above which COLMAP's solver refines poses and points, as where the
+    linear step would raise the cost. Chosen by hand."""
     most_tied: int = 250
     """Photos that a photo is tied to (`elimination_width`) above which COLMAP's solver takes conjugate gradients. Where
     all see the same, a factorization grows with the cube of the photos; along streets it is five times as fast.
