@@ -69,8 +69,8 @@ class MatchSettings(Section):
         4000,
         ge=0,
         le=100000,
-        description="photos with fewer features are searched again at twice their size, which takes four times as "
-        "long; for SIFT",
+        description="photos with fewer features are searched again at twice their area, with half as many at twice "
+        "their size; for SIFT",
     )
     max_ratio: float = Field(
         0.8, gt=0, le=1, description="largest nearest over second nearest descriptor distance, for SIFT; 1: no limit"
