@@ -141,7 +141,7 @@ def test_only_what_depends_on_the_size_is_done_again(measured, monkeypatch):
 
 def test_a_distance_that_contradicts_the_markers_is_named(measured):
     true = true_similarity(measured).scale
-    again(measured, markers=f"{SIDE_M}m", distances=[["0,0,0", "0.2,0,0", f"{0.2 * true * 1.1}m"]])
+    again(measured, markers=f"{SIDE_M}m", distances=[["0,0,0", "0.4,0,0", f"{0.4 * true * 1.1}m"]])
     found = read_scale(measured.out)
     assert len(found["contradictions"]) == 1 and "the distance of" in found["contradictions"][0]
     assert "10 % larger" in found["contradictions"][0] or "9.9 % larger" in found["contradictions"][0]
