@@ -143,8 +143,8 @@ class Linearized:
     """(P,) from `whiten_points`."""
     used: int
     """Number of observations that are not lost."""
-    inflation: float
-    """Variance of an estimate with this loss, over that of squared weighted residuals over H."""
+    tails: float
+    """From `tail_share`."""
 
     def eliminate_points(self) -> "sparse.csr_array":
         """Return the matrix (V, V) of the unknowns besides the points (Schur complement)."""
@@ -184,20 +184,17 @@ def linearize(
     by_view = by_view.reshape(count, 2, k, BLOCK).transpose(0, 2, 1, 3).reshape(-1, 2, BLOCK)
     J = bsr_array((by_view, blocks.ravel(), k * rows), shape=(2 * count, unknowns))
     B = bsr_array((by_point, bundle.point, rows), shape=(2 * count, 3 * len(bundle.X)))
-    inflation = variance_inflation(np.einsum("ni,ni->n", r[used], r[used]) / scale_px**2)
-    return Linearized(r.ravel(), J, B, B.T @ J, whiten, rank, int(np.count_nonzero(used)), inflation)
+    tails = tail_share(np.einsum("ni,ni->n", r[used], r[used]) / scale_px**2)
+    return Linearized(r.ravel(), J, B, B.T @ J, whiten, rank, int(np.count_nonzero(used)), tails)
 
 
-def variance_inflation(u: FloatArray) -> float:
-    """Return the variance of an M-estimator (Huber 1981) over that of weighted least squares with its weights.
+def tail_share(u: FloatArray) -> float:
+    """Return the sum of squares with the weights of SOFT_L1 over that with Cauchy's, of the same scale.
 
-    The squares (N,) of weighted residuals are over that of the scale. The weight is 1 - u, and the mean derivative
-    of the influence, over both directions in the image, its square.
+    Deviations must cover what the loss ignores: things that move, and lenses that the model does not describe. The
+    squares (N,) of residuals with Cauchy's weights are over that of the scale.
     """
-    weight = 1.0 - u
-    if not np.any(u):
-        return 1.0
-    return float(np.sum(weight * u) / np.sum(u) * np.mean(weight) / np.mean(weight**2) ** 2)
+    return float(np.sum(u / np.sqrt(1.0 - u)) / np.sum(u)) if np.any(u) else 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -280,7 +277,7 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
     step = solve_positive(H, g[:, None])[:, 0]
     explained = np.sum(gradient[free] * response[:, -1]) + np.sum(g * step)
     noise = (
-        observed.inflation * max(float(np.sum(rest**2) - explained), 0.0)
+        observed.tails * max(float(np.sum(rest**2) - explained), 0.0)
         + REDUCTION.usual_count * REDUCTION.usual_noise_px**2
     )
     redundancy = max(2 * observed.used - int(np.sum(observed.rank)) - len(free) - cameras, 0) + REDUCTION.usual_count

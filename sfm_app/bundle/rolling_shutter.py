@@ -245,7 +245,7 @@ def _solve(
     rest = observed.r - observed.by_view @ views
     residue, influences = observed.drop_points(rest), observed.drop_points(observed.by_view @ influence)
     redundancy = max(2 * observed.used - int(np.sum(observed.rank)) - len(poses), 0) + REDUCTION.usual_count
-    squares = observed.inflation * np.sum(residue**2) + REDUCTION.usual_count * REDUCTION.usual_noise_px**2
+    squares = observed.tails * np.sum(residue**2) + REDUCTION.usual_count * REDUCTION.usual_noise_px**2
     noise2 = float(squares / redundancy)
     by_photo = np.bincount(bundle.photo, np.sum((influences * residue).reshape(-1, 2), axis=1))
     deviation = MISFIT * np.sqrt(max(noise2 * variances[n - BLOCK], float(np.sum(by_photo**2))))
