@@ -184,17 +184,21 @@ def linearize(
     by_view = by_view.reshape(count, 2, k, BLOCK).transpose(0, 2, 1, 3).reshape(-1, 2, BLOCK)
     J = bsr_array((by_view, blocks.ravel(), k * rows), shape=(2 * count, unknowns))
     B = bsr_array((by_point, bundle.point, rows), shape=(2 * count, 3 * len(bundle.X)))
-    tails = tail_share(np.einsum("ni,ni->n", r[used], r[used]) / scale_px**2)
+    tails = tail_share(np.einsum("ni,ni->n", r[used], r[used]), scale_px)
     return Linearized(r.ravel(), J, B, B.T @ J, whiten, rank, int(np.count_nonzero(used)), tails)
 
 
-def tail_share(u: FloatArray) -> float:
-    """Return the sum of squares with the weights of SOFT_L1 over that with Cauchy's, of the same scale.
+def tail_share(weighted: FloatArray, scale_px: float) -> float:
+    """Return the mean square residual with the weights of SOFT_L1 over that with Cauchy's (N,), in px^2.
 
     Deviations must cover what the loss ignores: things that move, and lenses that the model does not describe. The
-    squares (N,) of residuals with Cauchy's weights are over that of the scale.
+    scale of SOFT_L1 is twice the usual noise.
     """
-    return float(np.sum(u / np.sqrt(1.0 - u)) / np.sum(u)) if np.any(u) else 1.0
+    if not np.any(weighted):
+        return 1.0
+    weight = 1.0 - weighted / scale_px**2
+    milder = (1.0 + weighted / weight / (2.0 * REDUCTION.usual_noise_px) ** 2) ** -0.5
+    return float(np.average(weighted / weight, weights=milder) / np.average(weighted / weight, weights=weight))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
