@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sfm_app.errors import ConfigError, PluginError
 from sfm_app.formats.exporters import INSTALL_HINT, Exporter, SceneExporter
 from sfm_app.settings import CalibrationSettings, EpipolarSettings, MatchSettings
-from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Features, Rejected
+from sfm_app.types import Calibration, CameraPairs, CameraPrior, EpipolarFit, Features, Rejected
 from sfm_app.types.arrays import FloatArray
 
 if TYPE_CHECKING:  # OpenCV, which stereo needs, takes longer to load than an estimator to run
@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # OpenCV, which stereo needs, takes longer to load than an es
 
 GROUP, BUILT_IN = "sfm_app", "sfm_app.built_in"
 """Entry points of plug-ins, and the module of the built-in methods."""
-AUTO, CPU = "auto", "cpu"
+AUTO, CPU, NONE = "auto", "cpu", "none"
 SIFT, SIFT_DSP = "sift", "sift-dsp"
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
@@ -46,6 +46,10 @@ The picture is (H, W, 3) RGB of 8 bits, at most `max_image_size_px` long. The ca
 keypoints back to its pixels, and drops masked ones and those beyond `max_features`."""
 MatchFeatures = Callable[[Features, Features, MatchSettings], NDArray[np.integer[Any]]]
 """Matches the features of two pictures: returns (M, 2) rows, each at most once; same features, same result."""
+FindCamera = Callable[[NDArray[np.uint8]], CameraPrior | None]
+"""Estimates the camera of one upright photo, (H, W, 3) RGB of 8 bits; None for no idea. Pixels are those of the photo.
+
+Deviations must cover the errors. The source is what users read as the author of the claim."""
 MakeDepthMaps = Callable[["DepthTask"], list[Rejected | None]]
 """Writes geometric depth and normal maps to the workspace; returns None per view, or why it has no map."""
 
@@ -108,6 +112,16 @@ class FeatureMethod:
         return _part_here, ("features", self.name)
 
 
+@dataclass(frozen=True, slots=True)
+class CameraPriorMethod:
+    """A named method that estimates the camera of a photo from its content, such as a neural network."""
+
+    name: str
+    find: FindCamera
+    summary: str = ""
+    unavailable: Callable[[], str] = str
+
+
 class Hooks:
     """The hooks of a plug-in, all optional."""
 
@@ -122,6 +136,10 @@ class Hooks:
     @hookspec
     def sfm_features(self) -> Iterable[FeatureMethod]:  # type: ignore[empty-body]
         """Return methods for features and matches."""
+
+    @hookspec
+    def sfm_camera_priors(self) -> Iterable[CameraPriorMethod]:  # type: ignore[empty-body]
+        """Return methods for priors on cameras."""
 
     @hookspec
     def sfm_exporters(self) -> Iterable[Exporter]:  # type: ignore[empty-body]
@@ -146,6 +164,7 @@ class Plugins:
     scene_exporters: Mapping[str, SceneExporter]
     depth_methods: Mapping[str, DepthMethod]
     features: Mapping[str, FeatureMethod]
+    camera_priors: Mapping[str, CameraPriorMethod]
 
     def estimator(self, name: str) -> Estimator:
         """Return an estimator; ConfigError names the known ones."""
@@ -166,6 +185,16 @@ class Plugins:
     def feature_method(self, name: str) -> FeatureMethod:
         """Return a feature method; ConfigError as in `exporter`."""
         return _look_up_available(self.features, name, "feature method", f"'{SIFT}' runs everywhere")
+
+    def camera_prior_method(self, name: str) -> CameraPriorMethod | None:
+        """Return a method for camera priors, or with "auto" the first that runs here; None without one.
+
+        ConfigError as in `exporter`.
+        """
+        if name == AUTO:
+            return next((one for one in self.camera_priors.values() if not one.unavailable()), None)
+        hint = f"'{AUTO}' takes an installed one, '{NONE}' takes none"
+        return None if name == NONE else _look_up_available(self.camera_priors, name, "method for camera priors", hint)
 
     def depth_method(self, name: str) -> tuple[DepthMethod, str]:
         """Return a depth method, or with "auto" the best that runs here, and why; ConfigError as in `exporter`."""
@@ -219,6 +248,7 @@ def _load(modules: Sequence[ModuleType | object], installed: bool) -> Plugins:
         scene_exporters=_index_by_name(manager.hook.sfm_scene_exporters(), exporters),
         depth_methods=_index_by_name(manager.hook.sfm_depth_methods()),
         features=_index_by_name(manager.hook.sfm_features()),
+        camera_priors=_index_by_name(manager.hook.sfm_camera_priors()),
     )
 
 
@@ -229,7 +259,7 @@ def _part_here(kind: str, name: str) -> Any:
     return built_in[name] if name in built_in else _look_up(getattr(installed_plugins(), kind), name, kind)
 
 
-Part = TypeVar("Part", Estimator, Calibrator, Exporter, SceneExporter, DepthMethod, FeatureMethod)
+Part = TypeVar("Part", Estimator, Calibrator, Exporter, SceneExporter, DepthMethod, FeatureMethod, CameraPriorMethod)
 
 
 def _index_by_name(results: Iterable[Iterable[Part]], others: Iterable[str] = ()) -> Mapping[str, Part]:
@@ -242,7 +272,7 @@ def _index_by_name(results: Iterable[Iterable[Part]], others: Iterable[str] = ()
     return MappingProxyType(by_name)
 
 
-Available = TypeVar("Available", Exporter, SceneExporter, DepthMethod, FeatureMethod)
+Available = TypeVar("Available", Exporter, SceneExporter, DepthMethod, FeatureMethod, CameraPriorMethod)
 
 
 def _look_up_available(parts: Mapping[str, Available], name: str, kind: str, hint: str) -> Available:

@@ -16,7 +16,6 @@ from sfm_app.bundle.lens_parts import (
     LOG_FOCAL,
     PARTS,
     LensPriors,
-    consistent_choices,
     model_name,
     part_names,
     step_cameras,
@@ -92,9 +91,9 @@ class LensEstimate:
     mean_squares: FloatArray
     """(C, 12, 12) mean squares and products of the errors of `params` over all choices; 0 if fixed or diverged."""
     free: BoolArray
-    """(C, 7) parts with the wide prior, in the order of PARTS."""
+    """(C, 8) parts with the wide prior, in the order of PARTS."""
     determined: BoolArray
-    """(C, 7) parts that the photos determine better than the prior."""
+    """(C, 8) parts that the photos determine better than the prior."""
     step: float
     """The largest change of a parameter, in standard deviations."""
     held: BoolArray
@@ -143,7 +142,7 @@ def evidence_weight(noise_px: float) -> float:
 
 
 def _estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors, free: BoolArray) -> LensEstimate:
-    """Return the most probable cameras for a choice of freed parts (C, 7), without a ranking."""
+    """Return the most probable cameras for a choice of freed parts (C, 8), without a ranking."""
     H, g, offsets = _weigh(params, reduced, priors)
     T = _logarithm_jacobian(params)
     precision = priors.precision(free)
@@ -206,7 +205,7 @@ def _find_determined(covariance: FloatArray, precision: FloatArray, priors: Lens
 def _choose(
     H: FloatArray, g: FloatArray, offsets: FloatArray, priors: LensPriors
 ) -> tuple[BoolArray, tuple[tuple[LensChoice, ...], ...]]:
-    """Return the most probable choice (C, 7), and the ranking of `LensEstimate`.
+    """Return the most probable choice (C, 8), and the ranking of `LensEstimate`.
 
     One sweep asks all cameras, with the choices for the others from before the sweep. Asking one after the other, as
     `selfcal.priors` does, takes a posterior of all cameras for each, which is too slow for hundreds.
@@ -250,7 +249,7 @@ def _mean_squares(
     for camera, own in enumerate(np.arange(len(step)).reshape(offsets.shape)):
         block = np.ix_(own, own)
         likelihood = cavity(covariance[block], mean[own], precision[camera], offsets[camera])
-        choices = priors.choice_priors(consistent_choices(int(priors.family[camera])), camera, offsets[camera])
+        choices = priors.choice_priors(priors.consistent_choices(camera), camera, offsets[camera])
         squares[block] = posteriors(*likelihood, choices).mean_squares(step[own])
     return squares
 

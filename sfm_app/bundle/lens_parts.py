@@ -4,6 +4,7 @@ Ours; the choice of free parts by marginal likelihood is that of `geometry.least
 about its usual value and a wide one.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from sfm_app.camera.models import (
     ASPECT,
     CENTER,
     FAMILIES,
+    FOCAL,
     FREE_SHARE,
     LENS,
     NARROW,
@@ -45,13 +47,14 @@ from sfm_app.camera.rows import (
     SY,
 )
 from sfm_app.geometry.least_squares import NormalPriors, binary_choices
-from sfm_app.types import Calibration
+from sfm_app.types import Calibration, CameraPrior
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 LOG_FOCAL, LOG_ASPECT = FX, FY
 """Columns of log sqrt(fx fy) and log fy/fx, which replace fx and fy."""
 FOCAL_SPREAD = 0.7
-"""Prior standard deviation of log f about the value from mapping: hardly a constraint. Chosen by hand."""
+"""Prior standard deviation of log f about the value from mapping, or about a claim that is wrong: hardly a constraint.
+Chosen by hand."""
 ABSENT = 1e-4
 """Narrow prior of the terms of `Part.exact`, which become 0, as a share of the corner's radius. Chosen by hand."""
 
@@ -80,6 +83,7 @@ class Part:
 
 _CENTER = Part("center", (CX, CY), NARROW[CENTER], WIDE[CENTER], FREE_SHARE[CENTER], True)
 _ASPECT = Part("aspect", (LOG_ASPECT,), NARROW[ASPECT], WIDE[ASPECT], FREE_SHARE[ASPECT], True)
+_FOCAL = Part("focal", (LOG_FOCAL,), FOCAL_SPREAD, FOCAL_SPREAD, FREE_SHARE[FOCAL])
 PERSPECTIVE_PARTS = (
     _CENTER,
     _ASPECT,
@@ -88,8 +92,9 @@ PERSPECTIVE_PARTS = (
     Part("p1 p2", (P1, P2), 0.0002, 0.002, 0.05, True),
     Part("k3", (K3,), ABSENT, 0.03, 0.1, powers=(6,), needs=("k1", "k2"), exact=True),
     Part("k4 k5 k6", (K4, K5, K6), ABSENT, 0.05, 0.05, powers=(2, 4, 6), needs=("k1", "k2", "k3"), exact=True),
+    _FOCAL,
 )
-"""Center, aspect and k1 as in `camera.models`; others: docs/algorithms/bundle-adjustment.md. Chosen by hand."""
+"""Focal, center, aspect and k1 as in `camera.models`; others: docs/algorithms/bundle-adjustment.md. Chosen by hand."""
 FISHEYE_PARTS = (
     _CENTER,
     _ASPECT,
@@ -98,6 +103,7 @@ FISHEYE_PARTS = (
     Part("p1 p2", (P1, P2), ABSENT, 0.002, 0.05, powers=(1, 1), exact=True),
     Part("k3 k4", (K3, K4), ABSENT, 0.05, 0.3, powers=(6, 8), needs=("k1", "k2"), exact=True),
     Part("thin prism", (SX, SY), ABSENT, 0.002, 0.05, powers=(1, 1), needs=("p1 p2",), exact=True),
+    _FOCAL,
 )
 """An equidistant lens is the usual one. At 175 degrees a stereographic lens has k1 0.19 and k2 0.05 of the radius, an
 equisolid one k1 -0.1. docs/algorithms/bundle-adjustment.md. Chosen by hand."""
@@ -108,8 +114,13 @@ COUNT = len(PERSPECTIVE_PARTS)
 
 
 def part_names(family: int, chosen: BoolArray) -> tuple[str, ...]:
-    """Return the names of parts (7,) of a camera."""
+    """Return the names of parts (8,) of a camera."""
     return tuple(part.name for part, on in zip(PARTS[family], chosen, strict=True) if on)
+
+
+def determined_names(family: int, chosen: BoolArray) -> tuple[str, ...]:
+    """Return the names of parts (8,) of a camera besides its focal, which no part leaves at its usual value."""
+    return tuple(name for name in part_names(family, chosen) if name != _FOCAL.name)
 
 
 def model_name(family: int, freed: tuple[str, ...]) -> str:
@@ -148,11 +159,14 @@ class LensPriors:
     reach: FloatArray
     """(C,) radius of the corners in focal lengths; of a fisheye, at most that of its largest angle."""
     estimated: BoolArray
-    """(C, 7) parts to estimate, in the order of PARTS; the others keep their values."""
+    """(C, 8) parts to estimate, in the order of PARTS; the others keep their values."""
     choices: tuple[BoolArray, ...]
-    """For each camera (K, 7) parts that may be freed together; choices that free less come first."""
+    """For each camera (K, 8) parts that may be freed together; choices that free less come first."""
     usual: FloatArray
-    """(C, 12) usual values of any camera, or the user's values for this one. Of fx and fy only the ratio counts."""
+    """(C, 12) usual values of any camera, or the user's values for this one. Where no focal is claimed, only the ratio
+    of fx and fy counts."""
+    claims: FloatArray
+    """(C, 12) narrow deviations about claimed values of log f, cx, cy and k1; NaN without a claim."""
     fixed: BoolArray
     """(C,) cameras that keep all of their parameters."""
 
@@ -163,21 +177,57 @@ class LensPriors:
         """Return the priors of cameras (C, 12), as in `Bundle`, before any evidence."""
         reach = np.hypot(*sizes.T) / (2.0 * np.sqrt(params[:, FX] * params[:, FY]))
         reach = np.where(family == FISHEYE, np.minimum(reach, SEEN_ANGLE), reach)
-        choices = []
-        for kind, row in zip(family, estimated, strict=True):
-            allowed = consistent_choices(int(kind))
-            choices.append(allowed[~np.any(allowed & ~row, axis=1)])
-        usual = np.zeros_like(params)
+        usual, claims = np.zeros_like(params), np.full_like(params, np.nan)
         usual[:, [FX, FY]], usual[:, [CX, CY]] = 1.0, sizes / 2.0
-        return cls(sizes, family, reach, estimated, tuple(choices), usual, np.zeros(len(params), np.bool_))
+        priors = cls(sizes, family, reach, estimated, (), usual, claims, np.zeros(len(params), np.bool_))
+        choices = map(priors.consistent_choices, range(len(params)))
+        return replace(
+            priors, choices=tuple(one[~np.any(one & ~row, axis=1)] for one, row in zip(choices, estimated, strict=True))
+        )
+
+    def consistent_choices(self, camera: int) -> BoolArray:
+        """Return all choices (K, 8) for a camera; a focal that nobody claims is no choice."""
+        choices = consistent_choices(int(self.family[camera]))
+        if np.isfinite(self.claims[camera, LOG_FOCAL]):
+            return choices
+        return choices[~choices[:, _is_focal(int(self.family[camera]))].ravel()]
 
     @property
     def sides(self) -> FloatArray:
         """(C,) longer sides in pixels."""
         return np.asarray(self.sizes.max(axis=1), np.float64)
 
+    def with_rules(self, rules: Sequence["CameraRule"]) -> "LensPriors":
+        """Return the priors under the user's rules and claims, one of each for every camera."""
+        usual, claims = self.usual.copy(), self.claims.copy()
+        for row, rule in enumerate(rules):
+            given = rule.usual(int(self.family[row]))
+            if given is not None:
+                usual[row] = given
+            elif rule.prior is not None:
+                prior = rule.prior
+                usual[row, [FX, FY]], claims[row, LOG_FOCAL] = prior.focal_px, prior.focal_deviation_px / prior.focal_px
+                if prior.center_px is not None:
+                    usual[row, [CX, CY]], claims[row, [CX, CY]] = prior.center_px, prior.center_deviation_px
+                if prior.k1 is not None and self.family[row] == PERSPECTIVE:
+                    usual[row, K1], claims[row, K1] = prior.k1, prior.k1_deviation
+        claimed = replace(self, usual=usual, claims=claims)
+        estimated, choices = self.estimated.copy(), list[BoolArray]()
+        for row, rule in enumerate(rules):
+            parts, allowed = rule.parts(int(self.family[row])), claimed.consistent_choices(row)
+            if rule.is_kept:
+                estimated[row], allowed = False, allowed[:1]
+            elif parts is not None:
+                allowed = choices_of_model(parts, allowed)
+                estimated[row] = allowed.any(axis=0) | _is_focal(int(self.family[row]))
+            else:
+                allowed = allowed[~np.any(allowed & ~estimated[row], axis=1)]
+            choices.append(allowed)
+        fixed = np.array([rule.is_kept for rule in rules], np.bool_)
+        return replace(claimed, estimated=estimated, choices=tuple(choices), fixed=fixed)
+
     def drop_lens(self, camera: int, free: BoolArray) -> "LensPriors":
-        """Return the priors without the choices for a camera that have the radial terms of a barred one (7,)."""
+        """Return the priors without the choices for a camera that have the radial terms of a barred one (8,)."""
         radial = [k for k, part in enumerate(PARTS[int(self.family[camera])]) if part.name.startswith("k")]
         differs = np.any(self.choices[camera][:, radial] != free[radial], axis=1)
         choices = list(self.choices)
@@ -185,35 +235,38 @@ class LensPriors:
         return replace(self, choices=tuple(choices))
 
     def deviations(self, camera: int, free: BoolArray) -> FloatArray:
-        """Return (K, 12) standard deviations of the prior of a camera under choices (K, 7)."""
+        """Return (K, 12) standard deviations of the prior of a camera under choices (K, 8)."""
         deviations = np.full((len(free), CAMERA), FOCAL_SPREAD)
         for k, part in enumerate(PARTS[int(self.family[camera])]):
             unit = self.sides[camera] if part.name == "center" else 1.0
-            sigma = np.where(free[:, k], part.wide, part.narrow) * unit
             for place, power in zip(part.places, part.powers or (0,) * len(part.places), strict=True):
-                deviations[:, place] = sigma * self.reach[camera] ** -power
+                narrow, wide = np.array([part.narrow, part.wide]) * unit * self.reach[camera] ** -power
+                claim = self.claims[camera, place]
+                deviations[:, place] = np.where(free[:, k], wide, claim if np.isfinite(claim) else narrow)
         return deviations
 
     def precision(self, free: BoolArray) -> FloatArray:
-        """Return (C, 12) precisions of the prior, the wide one for the parts in `free` (C, 7)."""
+        """Return (C, 12) precisions of the prior, the wide one for the parts in `free` (C, 8)."""
         rows = [self.deviations(camera, free[[camera]])[0] for camera in range(len(free))]
         return np.asarray(np.array(rows).reshape(-1, CAMERA) ** -2.0, np.float64)
 
     def choice_priors(self, choices: BoolArray, camera: int, offsets: FloatArray) -> NormalPriors:
-        """Return the priors of one camera under choices (K, 7), for offsets (12,) from it to its usual values."""
+        """Return the priors of one camera under choices (K, 8), for offsets (12,) from it to its usual values."""
         share = np.array([part.share for part in PARTS[int(self.family[camera])]])
         log_odds = np.sum(np.log(np.where(choices, share, 1.0 - share)), axis=1)
         return NormalPriors(self.deviations(camera, choices) ** -2.0, np.tile(offsets, (len(choices), 1)), log_odds)
 
     def prior_offsets(self, params: FloatArray) -> FloatArray:
-        """Return (C, 12) offsets from the cameras to their usual values; 0 for focals and for parts not estimated."""
+        """Return (C, 12) offsets from the cameras to their usual values; 0 for those that are open or not estimated."""
         offsets = self.usual - params
-        offsets[:, LOG_FOCAL] = 0.0
+        focals = np.sqrt(params[:, FX] * params[:, FY]), np.sqrt(self.usual[:, FX] * self.usual[:, FY])
+        claimed = np.isfinite(self.claims[:, LOG_FOCAL])
+        offsets[:, LOG_FOCAL] = np.where(claimed, np.log(focals[1] / focals[0]), 0.0)
         offsets[:, LOG_ASPECT] = np.log(params[:, FX] / params[:, FY]) - np.log(self.usual[:, FX] / self.usual[:, FY])
         return np.where(self.parameter_mask(self.estimated), offsets, 0.0)
 
     def parameter_mask(self, parts: BoolArray) -> BoolArray:
-        """Return (C, 12) mask of the parameters of some parts (C, 7), and of the focal."""
+        """Return (C, 12) mask of the parameters of some parts (C, 8)."""
         chosen = np.ones((len(parts), CAMERA), np.bool_)
         for camera, row in enumerate(parts):
             for part, on in zip(PARTS[int(self.family[camera])], row, strict=True):
@@ -222,11 +275,11 @@ class LensPriors:
 
     @property
     def required(self) -> BoolArray:
-        """(C, 7) parts that every choice frees because the user named the model; they move, determined or not."""
+        """(C, 8) parts that every choice frees because the user named the model; they move, determined or not."""
         return np.array([one.all(axis=0) & (len(one) > 0) for one in self.choices], np.bool_).reshape(-1, COUNT)
 
     def part_mask(self, quality: str) -> BoolArray:
-        """Return (C, 7) which parts have a quality: "stays" or "exact"."""
+        """Return (C, 8) which parts have a quality: "stays" or "exact"."""
         rows = [[bool(getattr(part, quality)) for part in PARTS[int(kind)]] for kind in self.family]
         return np.array(rows, np.bool_).reshape(-1, COUNT)
 
@@ -239,8 +292,12 @@ class LensPriors:
         return bool(np.isnan(angle_limit(params, int(self.family[camera]), farthest)))
 
 
+def _is_focal(family: int) -> BoolArray:
+    return np.array([part is _FOCAL for part in PARTS[family]], np.bool_)
+
+
 def consistent_choices(family: int) -> BoolArray:
-    """Return choices (K, 7) in which no free part lacks a part that it needs; choices that free less come first."""
+    """Return choices (K, 8) in which no free part lacks a part that it needs; choices that free less come first."""
     names = [part.name for part in PARTS[family]]
     choices = binary_choices(len(names))
     for k, part in enumerate(PARTS[family]):
@@ -266,6 +323,8 @@ class CameraRule:
 
     given: Calibration | None = None
     """The user's camera: parameters that the photos do not determine stay near these values."""
+    prior: CameraPrior | None = None
+    """Claim about the camera, which the photos may contradict."""
     model: str = ""
     """COLMAP's name of the camera model to fit; empty for the model that the photos support best."""
 
@@ -288,12 +347,14 @@ class CameraRule:
         return row_of_calibration(self.given)
 
     def parts(self, family: int) -> BoolArray | None:
-        """Return (7,) the parts of the model besides its center; None if it is open, or not of this family."""
+        """Return (8,) the parts of the model besides focal and center; None if it is open, or not of this family."""
         if not self.model or self.family != family or family == PANORAMA:
             return None
         names = (*TWO_FOCALS, *TERMS[PROJECTIONS[family]])
         has = set(PARAMETERS[self.model])
-        rows = [part.name != "center" and has.issuperset(names[k] for k in part.places) for part in PARTS[family]]
+        rows = [
+            part not in (_FOCAL, _CENTER) and has.issuperset(names[k] for k in part.places) for part in PARTS[family]
+        ]
         return np.array(rows, np.bool_)
 
 
@@ -318,17 +379,17 @@ def calibration_from_params(
 
 
 def fit_to_model(params: FloatArray, parts: BoolArray, family: int) -> FloatArray:
-    """Return a camera (12,) without the parameters of parts (7,) that its model lacks: square pixels, terms of 0."""
+    """Return a camera (12,) without the parameters of parts (8,) that its model lacks: square pixels, terms of 0."""
     fitted = params.copy()
     for part, on in zip(PARTS[family], parts, strict=True):
         if part.name == "aspect" and not on:
             fitted[[FX, FY]] = np.sqrt(params[FX] * params[FY])
-        elif part.name != "center" and not on:
+        elif part not in (_FOCAL, _CENTER) and not on:
             fitted[list(part.places)] = 0.0
     return fitted
 
 
 def choices_of_model(parts: BoolArray, choices: BoolArray) -> BoolArray:
-    """Return those of all consistent choices (M, 7) that have exactly these parts (7,) besides the center."""
-    center = np.array([part.name == "center" for part in PARTS[PERSPECTIVE]], np.bool_)
-    return choices[np.all(choices[:, ~center] == parts[~center], axis=1)]
+    """Return those of all consistent choices (M, 8) that have exactly these parts (8,) besides focal and center."""
+    is_open = np.array([part in (_FOCAL, _CENTER) for part in PARTS[PERSPECTIVE]], np.bool_)
+    return choices[np.all(choices[:, ~is_open] == parts[~is_open], axis=1)]

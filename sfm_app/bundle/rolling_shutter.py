@@ -354,7 +354,7 @@ def estimate_readout(
 ) -> ReadoutEstimate:  # fmt: skip
     """Adjust poses, points, cameras and the readout together; with a known readout, only poses and points.
 
-    The bundle of nine or more photos is adjusted for a global shutter. `freed` (C, 7) are the parts of the cameras with
+    The bundle of nine or more photos is adjusted for a global shutter. `freed` (C, 8) are the parts of the cameras with
     the wide prior; `start` is an earlier estimate for the same photos.
     """
     fits = path_velocities(bundle.R, bundle.t, rows.times).select_most_predictive()

@@ -373,9 +373,18 @@ def plugins() -> None:
     from sfm_app.plugins import load_plugins
 
     methods = load_plugins()
-    for kind in ("features", "estimators", "calibrators", "exporters", "scene_exporters", "depth_methods"):
+    for kind in (
+        "features",
+        "camera_priors",
+        "estimators",
+        "calibrators",
+        "exporters",
+        "scene_exporters",
+        "depth_methods",
+    ):
         rows = table({method.name: method.summary for method in getattr(methods, kind).values()})
-        print_text([f"{kind.replace('_', ' ')}:", *(f"  {row}" for row in rows)])
+        if rows:
+            print_text([f"{kind.replace('_', ' ')}:", *(f"  {row}" for row in rows)])
 
 
 @click.command()

@@ -27,10 +27,8 @@ from sfm_app.bundle.lens_parts import (
     CameraRule,
     LensPriors,
     calibration_from_params,
-    choices_of_model,
-    consistent_choices,
+    determined_names,
     fit_to_model,
-    part_names,
 )
 from sfm_app.bundle.normal_equations import Bundle, best_step, bundle_scale, cost, elimination_width, reduce
 from sfm_app.camera.models import FILE_MODELS, INDEX, PARAMETERS, file_model, params_of_row, row_of_calibration
@@ -251,28 +249,10 @@ def lens_priors(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle, 
     used = photos_per_camera(model)
     sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
     many = np.array([used[camera_id] >= OPTIONS.min_photos for camera_id in ids])
-    only_k1 = [[part.name == "k1" for part in PARTS[int(kind)]] for kind in bundle.family]
-    estimated = (many[:, None] | np.array(only_k1).reshape(-1, COUNT)) & (bundle.family != PANORAMA)[:, None]
+    always = [[part.name in ("focal", "k1") for part in PARTS[int(kind)]] for kind in bundle.family]
+    estimated = (many[:, None] | np.array(always).reshape(-1, COUNT)) & (bundle.family != PANORAMA)[:, None]
     priors = LensPriors.from_cameras(bundle.params, bundle.family, sizes, estimated)
-    return _apply_rules(priors, [rules.get(camera_id, NO_RULE) for camera_id in ids]) if rules else priors
-
-
-def _apply_rules(priors: LensPriors, rules: Sequence[CameraRule]) -> LensPriors:
-    """Return the priors under the user's rules, one for each camera."""
-    estimated, usual, choices = priors.estimated.copy(), priors.usual.copy(), list(priors.choices)
-    for row, rule in enumerate(rules):
-        family = int(priors.family[row])
-        given, parts = rule.usual(family), rule.parts(family)
-        if given is not None:
-            usual[row] = given
-        if rule.is_kept:
-            estimated[row] = False
-            choices[row] = priors.choices[row][:1]
-        elif parts is not None:
-            choices[row] = choices_of_model(parts, consistent_choices(family))
-            estimated[row] = choices[row].any(axis=0)
-    fixed = np.array([rule.is_kept for rule in rules], np.bool_)
-    return replace(priors, estimated=estimated, usual=usual, choices=tuple(choices), fixed=fixed)
+    return priors.with_rules([rules.get(camera_id, NO_RULE) for camera_id in ids]) if rules else priors
 
 
 # The camera model that the photos support: other families of a lens, and the ranking of all models.
@@ -486,7 +466,7 @@ def refined_cameras(rounds: Rounds) -> dict[int, RefinedCamera]:
         entries = {name: float(lenses.deviations[row][place]) for name, place in zip(names, places, strict=True)}
         refined[camera_id] = RefinedCamera(
             deviations=finite_entries(entries),
-            determined=part_names(int(rounds.bundle.family[row]), lenses.determined[row]),
+            determined=determined_names(int(rounds.bundle.family[row]), lenses.determined[row]),
             correlations=named_correlations(names, lenses.mean_squares[row][np.ix_(places, places)]),
         )
     return refined
@@ -547,7 +527,7 @@ def given_estimates(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules
         if camera_id not in rules or rules[camera_id].given is None or lenses.held[row] or family == PANORAMA:
             continue
         camera = model.cameras[camera_id]
-        determined = part_names(family, lenses.determined[row])
+        determined = determined_names(family, lenses.determined[row])
         estimates[camera_id] = calibration_from_params(
             lenses.params[row], family, (camera.width, camera.height), lenses.deviations[row], determined
         )

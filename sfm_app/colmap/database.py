@@ -106,7 +106,7 @@ def matched_image(key: int, photo: Photo) -> MatchedImage:
     """Return a photo with its id."""
     return MatchedImage(
         key, photo.name, photo.group, photo.width, photo.height,
-        photo.exif_focal_px, photo.gps, photo.turn_deg, photo.shown, photo.projection, photo.time_s,
+        photo.prior, photo.gps, photo.turn_deg, photo.shown, photo.projection, photo.time_s,
     )  # fmt: skip
 
 

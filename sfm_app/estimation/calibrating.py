@@ -9,19 +9,10 @@ from typing import Any
 import numpy as np
 
 from sfm_app.camera_files import run_camera
+from sfm_app.estimation.claims import Claim, claim, photo_prior, report_claims
 from sfm_app.estimation.diagnosis import diagnose_fits, inliers_by_degeneracy
 from sfm_app.estimation.fitting import find_views, mostly_known_groups
-from sfm_app.estimation.given_cameras import (
-    CENTERS,
-    Contradiction,
-    FocalClaim,
-    assign_cameras,
-    find_contradictions,
-    focal_claim,
-    report_checks,
-    report_claims,
-    shown_share,
-)
+from sfm_app.estimation.given_cameras import CENTERS, Contradiction, find_contradictions, given_cameras, report_checks
 from sfm_app.fundamental.rays import select_inliers
 from sfm_app.numerical import FAILURES
 from sfm_app.retrieval import choose_by_rank
@@ -111,7 +102,7 @@ def find_intrinsics(matches: MatchGraph, views: ViewGraph, run: RunContext) -> I
     images = matches.images.values()
     for group, lens in views.lenses.items():  # they precede the fundamental matrices
         cameras.append(CalibratedCamera(group, tuple(image.id for image in images if image.group == group), lens))
-    report_claims({camera.name: _exif_claim(camera, matches) for camera in cameras}, run)
+    report_claims({camera.name: _claim(camera, matches) for camera in cameras}, run)
     cameras = _take_given_cameras(cameras, matches, run)
     return to_intrinsics((replace(camera, found=explain_failure(camera, views)) for camera in cameras), matches)
 
@@ -161,18 +152,18 @@ def _calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> list[C
     return [to_whole_photo(camera, matches.images[camera.photos[0]]) for camera in cameras]
 
 
-def _exif_claim(camera: CalibratedCamera, matches: MatchGraph) -> FocalClaim | None:
-    calibration, images = camera.found, [matches.images[photo] for photo in camera.photos]
+def _claim(camera: CalibratedCamera, matches: MatchGraph) -> Claim | None:
+    calibration = camera.found
     if not calibration.identifiable or calibration.is_given or calibration.projection == EQUIRECTANGULAR:
         return None
-    return focal_claim(images, calibration.focal_px, calibration.spread.get("fx", 0.0))
+    return claim((matches.images[photo] for photo in camera.photos), calibration)
 
 
 def _take_given_cameras(
     cameras: Sequence[CalibratedCamera], matches: MatchGraph, run: RunContext
 ) -> list[CalibratedCamera]:
     """Replace calibrated cameras by those that the user gave; those with a wide lens were checked before."""
-    given = assign_cameras(matches, run.given, keep=run.settings.calibration.keep).cameras
+    given = given_cameras(matches, run).cameras
     result, checked = [], {}
     for camera in cameras:
         group = matches.images[camera.photos[0]].group
@@ -225,7 +216,7 @@ def photo_pairs(
         inliers=tuple(np.hstack(matches.points(pair))[fit.inliers] for pair, fit in fits.items()),
         sizes={image.id: image.shown[2:] if image.shown else (image.width, image.height) for image in images},
         groups={image.id: image.group for image in images},
-        focal_hints_px={image.id: image.exif_focal_px * shown_share(image) for image in images if image.exif_focal_px},
+        priors={image.id: prior for image in images if (prior := photo_prior(image)) is not None},
         padded_sizes={image.id: (image.width, image.height) for image in images if image.shown},
     ).with_origins({image.id: image.shown[:2] for image in images if image.shown})
 
@@ -285,15 +276,12 @@ def _is_contradicted(
     camera: Calibration, images: Sequence[MatchedImage], matches: MatchGraph, views: ViewGraph, run: RunContext,
     known: Collection[str],
 ) -> bool:  # fmt: skip
-    """Return whether EXIF or the pairs of the new photos of a group contradict the camera."""
+    """Return whether claims or the pairs of the new photos of a group contradict the camera."""
     new = [image for image in images if image.name not in known]
-    claim, before = (
-        focal_claim(some, camera.focal_px, camera.spread["fx"])
-        for some in (new, [image for image in images if image.name in known])
-    )
+    claimed, before = (claim(some, camera) for some in (new, [image for image in images if image.name in known]))
     contradictions = []
-    if claim is not None and claim.is_contradicted and not (before is not None and before.is_contradicted):
-        contradictions.append(claim.text)
+    if claimed is not None and claimed.is_contradicted and not (before is not None and before.is_contradicted):
+        contradictions.append(claimed.text)
     if not contradictions:
         contradictions += [one.text for one in _pair_contradictions(camera, new, matches, views, run)]
     for text in contradictions:

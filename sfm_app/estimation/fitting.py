@@ -11,7 +11,7 @@ import numpy as np
 from sfm_app.camera.bearings import SHARES, bearings, deviation_key, field_of_view_deg
 from sfm_app.camera.models import camera_matrix, guessed_camera_matrix, panorama_camera, projection_of_model
 from sfm_app.errors import ConfigError
-from sfm_app.estimation.given_cameras import assign_cameras, report_checks
+from sfm_app.estimation.given_cameras import given_cameras, report_checks
 from sfm_app.files import load_arrays, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.fundamental.degeneracy import Fit, find_stationary, fit_moving, is_widespread, one_per_cell
 from sfm_app.fundamental.rays import fit_lev_ransac_rays
@@ -72,7 +72,7 @@ def find_lenses(
             f"{len(others)} photos are not panoramas, such as {others[0]}",
             hint="omit --camera-model EQUIRECTANGULAR; panoramas are detected automatically",
         )
-    given = assign_cameras(matches, run.given, keep=run.settings.calibration.keep)
+    given = given_cameras(matches, run)
     if given.notes:
         run.record(given_camera_notes=list(given.notes))
     for note in given.notes:

@@ -1,19 +1,17 @@
-"""Cameras and focal lengths that the user or EXIF states, and whether the photos contradict them."""
+"""Cameras that the user gives, and whether the photos contradict them."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sfm_app.bundle.lens_parts import CameraRule
 from sfm_app.camera.bearings import corner_angle, radius_deviation_px, radius_px
-from sfm_app.colmap.backend import Reconstruction
 from sfm_app.colmap.bundle import Adjustment
 from sfm_app.colmap.model import posed_images
 from sfm_app.errors import InputError
 from sfm_app.numerical import Json
 from sfm_app.runtime.context import RunContext
-from sfm_app.types import Calibration, GivenCameras, Intrinsics, MatchedImage, MatchGraph, Scene
+from sfm_app.types import Calibration, GivenCameras, Intrinsics, MatchedImage, MatchGraph, Photo
 from sfm_app.types.camera import EQUIRECTANGULAR, KEPT
 
 # Cameras of a calibration file, for the photos of a run.
@@ -29,7 +27,16 @@ class AssignedCameras:
     """Remarks for the user: which cameras were scaled, and which photos have none and why."""
 
 
-def assign_cameras(matches: MatchGraph, given: GivenCameras, *, keep: bool) -> AssignedCameras:
+def given_cameras(matches: MatchGraph, run: RunContext) -> AssignedCameras:
+    """Return the given cameras of a run; none where they are only claims, see `claims`."""
+    options = run.settings.calibration
+    given = GivenCameras() if options.deviation else run.given
+    return assign_cameras(matches.groups, given, keep=options.keep)
+
+
+def assign_cameras(
+    groups: Mapping[str, Sequence[Photo | MatchedImage]], given: GivenCameras, *, keep: bool
+) -> AssignedCameras:
     """Return the given camera of every camera group that has one.
 
     A group has the camera that the file names for its photos, or by the name of the group; else the only one of the
@@ -39,7 +46,7 @@ def assign_cameras(matches: MatchGraph, given: GivenCameras, *, keep: bool) -> A
     if not given:
         return AssignedCameras()
     cameras, notes, rejections = {}, [], []
-    for group, images in matches.groups.items():
+    for group, images in groups.items():
         if images[0].projection == EQUIRECTANGULAR:
             continue  # nothing about a panorama is unknown
         name, reason = _choose_name(group, images, given)
@@ -56,7 +63,7 @@ def assign_cameras(matches: MatchGraph, given: GivenCameras, *, keep: bool) -> A
     return AssignedCameras(cameras, (*notes, *rejections))
 
 
-def fit_to_photos(camera: Calibration, image: MatchedImage) -> tuple[Calibration | None, str]:
+def fit_to_photos(camera: Calibration, image: Photo | MatchedImage) -> tuple[Calibration | None, str]:
     """Return a camera in pixels of a photo, and a note if it was scaled; None with the reason where it cannot be."""
     size = image.width, image.height
     if camera.projection == EQUIRECTANGULAR:
@@ -93,7 +100,7 @@ def _scale(
     return replace(camera, K=K, width=size[0], height=size[1], spread=spread), note
 
 
-def _choose_name(group: str, images: Sequence[MatchedImage], given: GivenCameras) -> tuple[str | None, str]:
+def _choose_name(group: str, images: Sequence[Photo | MatchedImage], given: GivenCameras) -> tuple[str | None, str]:
     """Return the name of a group's camera in the file; None with the reason where it has none."""
     named = {given.camera_name(image.name) for image in images} - {None}
     if len(named) == 1:
@@ -132,10 +139,6 @@ class CheckOptions:
     """Largest compared angle: the corners hold few matches."""
     angles: int = 20
     """Number of compared angles."""
-    exif_tolerance: float = 0.08
-    """Share of the focal by which EXIF may be off: rounding, the diagonal, and breathing lenses."""
-    exif_sigmas: float = 3.0
-    """Standard deviations of the focal that the difference to EXIF must exceed, too."""
 
 
 OPTIONS = CheckOptions()
@@ -192,7 +195,7 @@ def find_contradictions(given: Calibration, estimated: Calibration) -> list[Cont
     """Return the properties of a given camera that the photos contradict; empty where they do not determine it."""
     if EQUIRECTANGULAR in (given.projection, estimated.projection) or not estimated.identifiable:
         return []
-    return [*_curve_contradictions(given, estimated), *_center_contradictions(given, estimated)]
+    return [*_curve_contradictions(given, estimated), *center_contradictions(given, estimated)]
 
 
 def _curve_contradictions(given: Calibration, estimated: Calibration) -> list[Contradiction]:
@@ -218,7 +221,8 @@ def _curve_contradictions(given: Calibration, estimated: Calibration) -> list[Co
     return [Contradiction(what, float(radii[0][worst]), float(radii[1][worst]), float(deviations[worst]))]
 
 
-def _center_contradictions(given: Calibration, estimated: Calibration) -> list[Contradiction]:
+def center_contradictions(given: Calibration, estimated: Calibration) -> list[Contradiction]:
+    """Return the coordinates of a given center that the photos contradict; none where they do not determine it."""
     if "center" in estimated.held:
         return []
     least, contradictions = OPTIONS.min_share * max(estimated.width, estimated.height), []
@@ -230,86 +234,7 @@ def _center_contradictions(given: Calibration, estimated: Calibration) -> list[C
     return contradictions
 
 
-# Checks of focal lengths in EXIF. A later crop leaves the focal in pixels as it was, while the claim shrinks with the
-# longer side.
-
-
-@dataclass(frozen=True, slots=True)
-class FocalClaim:
-    """Focal length of a camera in EXIF, and from its photos."""
-
-    claimed_px: float
-    """Median over its photos."""
-    photos: int
-    """Number of photos with a claim."""
-    found_px: float
-    deviation_px: float
-
-    @property
-    def is_contradicted(self) -> bool:
-        """Whether the photos exclude the claim."""
-        off = abs(self.found_px - self.claimed_px)
-        return off > OPTIONS.exif_tolerance * self.found_px and off > OPTIONS.exif_sigmas * self.deviation_px
-
-    @property
-    def text(self) -> str:
-        """Both focals, and a likely cause."""
-        deviation = f" +- {self.deviation_px:.3g}" if self.deviation_px > 0.0 else ""
-        longer = self.found_px > self.claimed_px
-        reason = "they were cropped or zoomed" if longer else "they were joined, or taken through another lens"
-        return f"EXIF says {self.claimed_px:.0f} px, the photos say {self.found_px:.0f}{deviation}: {reason}"
-
-    def to_dict(self) -> dict[str, Json]:
-        """Return plain values for the manifest."""
-        values = {"claimed_px": self.claimed_px, "found_px": self.found_px, "deviation_px": self.deviation_px}
-        rounded: dict[str, Json] = {name: round(value, 2) for name, value in values.items()}
-        text = {"text": self.text} if self.is_contradicted else {}
-        return rounded | {"photos": self.photos, "contradicted": self.is_contradicted} | text
-
-
-def focal_claim(images: Iterable[MatchedImage], found_px: float, deviation_px: float) -> FocalClaim | None:
-    """Return the claim of EXIF about a camera with this focal and standard deviation; None without EXIF."""
-    claims = [image.exif_focal_px * shown_share(image) for image in images if image.exif_focal_px]
-    return FocalClaim(float(np.median(claims)), len(claims), found_px, deviation_px) if claims else None
-
-
-def shown_share(image: MatchedImage) -> float:
-    """Return the longer side of the picture inside its bars over that of the photo, as in the focal of EXIF."""
-    return max(image.shown[2:]) / max(image.width, image.height) if image.shown else 1.0
-
-
-def report_claims(claims: Mapping[str, FocalClaim | None], run: RunContext) -> None:
-    """Announce the claims that the photos contradict, and record all, by name of the camera."""
-    stated = {name: claim for name, claim in claims.items() if claim is not None}
-    if not stated:
-        return
-    for name, claim in stated.items():
-        if claim.is_contradicted:
-            run.progress.say(f"the photos {name}: {claim.text}")
-    run.record(exif_focals={name: claim.to_dict() for name, claim in stated.items()})
-
-
-# Rules of the last adjustment, and checks after it.
-
-
-def camera_rules(
-    model: Reconstruction, names: Mapping[str, str], intrinsics: Intrinsics, camera_model: str
-) -> dict[int, CameraRule]:
-    """Return the rules of the user about the cameras of a model, by camera id; empty for none.
-
-    `names` has the camera of each photo by photo name. `camera_model` is COLMAP's model of all cameras; "auto"
-    for the one that the photos support.
-    """
-    rules = {}
-    for image in posed_images(model):
-        camera = intrinsics.cameras.get(names[image.name])
-        rule = CameraRule(
-            given=camera if camera is not None and camera.is_given else None,
-            model="" if camera_model == "auto" else camera_model,
-        )
-        if rule.given is not None or rule.model:
-            rules[image.camera_id] = rule
-    return rules
+# Checks after the last adjustment.
 
 
 def given_and_found(
@@ -319,17 +244,3 @@ def given_and_found(
     ids = {names[image.name]: image.camera_id for image in posed_images(adjusted.model)}
     known = {name: intrinsics.cameras[name] for name in ids if name in intrinsics.cameras}
     return {name: (camera, adjusted.estimates.get(ids[name])) for name, camera in known.items() if camera.is_given}
-
-
-def refined_claims(scene: Scene, intrinsics: Intrinsics, matches: MatchGraph) -> dict[str, FocalClaim | None]:
-    """Return the claims of EXIF about cameras that only the last adjustment determined, by name."""
-    known = {name for name, camera in intrinsics.cameras.items() if camera.identifiable}
-    photos: dict[str, list[MatchedImage]] = {name: [] for name in scene.cameras}
-    for image in matches.images.values():
-        if image.name in scene.camera_of:
-            photos[scene.camera_of[image.name]].append(image)
-    return {
-        name: focal_claim(photos[name], float(np.sqrt(camera.K[0, 0] * camera.K[1, 1])), camera.deviations["fx"])
-        for name, camera in scene.cameras.items()
-        if name not in known and "fx" in camera.deviations
-    }

@@ -236,7 +236,7 @@ def _map_rival(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
 
 def _focal_reason(best: Outcome, _: Mapper) -> str:
     evidence = best.evidence
-    known = any(camera.is_estimated or camera.method == "exif" for camera in evidence.intrinsics.cameras.values())
+    known = any(camera.is_estimated or camera.is_claimed for camera in evidence.intrinsics.cameras.values())
     connected = len(photos_with_geometry(best.trusted))
     if known or connected > OPTIONS.max_photos_for_focals:
         return ""

@@ -194,7 +194,7 @@ def guessed_intrinsics(intrinsics: Intrinsics, sides: float = GUESSED_FOCAL) -> 
     """Replace every perspective camera without a stated focal by a guess of `sides` longer sides."""
     cameras = {
         name: guess_again(camera, sides * max(camera.width, camera.height), camera.reason)
-        if camera.projection == PERSPECTIVE and camera.method != "exif" and not camera.is_given
+        if camera.projection == PERSPECTIVE and not (camera.is_claimed or camera.is_given)
         else camera
         for name, camera in intrinsics.cameras.items()
     }

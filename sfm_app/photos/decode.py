@@ -19,7 +19,8 @@ from PIL.ExifTags import GPS, IFD, Base
 
 from sfm_app.operating_system import find_in_wheel
 from sfm_app.photos.files import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
-from sfm_app.types import GpsPosition
+from sfm_app.types import CameraPrior, GpsPosition
+from sfm_app.types.photos import EXIF
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
 """Formats that every Pillow can read."""
@@ -29,6 +30,8 @@ LARGE_PX = 50_000_000
 MOST_FRAMES = 100
 DAMAGED = "truncated or damaged"
 LARGE_PHOTO_LOCK = Lock()
+EXIF_DEVIATION = 0.04
+"""Standard deviation of EXIF's focal, as a share of it: millimeters and sensor sizes are rounded; by hand."""
 SENSOR_UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """Length of EXIF's units of the sensor's resolution; 2, the inch, is the default. By definition."""
 
@@ -56,8 +59,8 @@ def camera_name(exif: Image.Exif) -> str:
     return " ".join(text for text in (printable_text(value) for value in parts) if text)
 
 
-def focal_px(exif: Image.Exif, longer_side: int) -> float | None:
-    """Return EXIF's focal length in pixels, by the 35 mm equivalent or else the sensor; None if it is implausible."""
+def exif_prior(exif: Image.Exif, longer_side: int) -> CameraPrior | None:
+    """Return EXIF's claim of a focal, by the 35 mm equivalent or else the sensor; None if it is implausible."""
     details = exif.get_ifd(IFD.Exif)
     for claim in (_equivalent_focal, _sensor_focal):
         try:
@@ -65,7 +68,7 @@ def focal_px(exif: Image.Exif, longer_side: int) -> float | None:
         except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
             continue
         if 0.1 * longer_side < focal < 50 * longer_side:
-            return focal
+            return CameraPrior(EXIF, focal, EXIF_DEVIATION * focal)
     return None
 
 

@@ -218,7 +218,7 @@ class Pair:
         self.cameras = tuple(cameras)
         self.lines = np.hstack([bearings(x, camera) for x, camera in zip(points, cameras, strict=True)])
         self.max_error_px = max_error_px
-        self.trusted = all(camera.is_estimated or camera.method == "exif" for camera in cameras)
+        self.trusted = all(camera.is_estimated or camera.is_claimed for camera in cameras)
 
     def initial_pose(self, fit: EpipolarGeometry) -> Pose:
         """Return R and t from F and the cameras, before refinement."""

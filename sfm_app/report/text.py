@@ -9,12 +9,12 @@ from sfm_app.camera.models import calibration_from_model
 from sfm_app.frame.sighted_points import Distance
 from sfm_app.settings import FIRST_TRIAL, HYPOTHESES
 from sfm_app.types import Calibration, CameraModel, Intrinsics, Scene
-from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, GIVEN, KEPT
+from sfm_app.types.camera import CLAIM, EQUIRECTANGULAR, FISHEYE, GIVEN, KEPT
 from sfm_app.wording import format_length, list_names
 
 # A calibration in everyday words.
 
-SOURCES = {"exif": "from EXIF", "guess": "a guess", "estimate": "an estimate"}
+SOURCES = {CLAIM: "a claim", "guess": "a guess", "estimate": "an estimate"}
 """Source of the values of an undetermined camera, by its method."""
 HELD = {
     "center": "optical center near the middle of the photo",
@@ -127,8 +127,8 @@ def refined_text(camera: CameraModel) -> str:
 
 
 def contradiction_lines(counts: Mapping[str, Any]) -> list[str]:
-    """Return remarks and warnings about given cameras and EXIF focals that the photos contradict."""
-    given, claims = counts.get("given_cameras", {}), counts.get("exif_focals", {})
+    """Return remarks and warnings about given and claimed cameras that the photos contradict."""
+    given, claims = counts.get("given_cameras", {}), counts.get("camera_claims", {})
     many = len(claims) > 1
     remarks = [f"{f'{name}: ' if many else ''}{one['text']}" for name, one in claims.items() if "text" in one]
     return [*counts.get("given_camera_notes", ()), *remarks] + [

@@ -35,9 +35,9 @@ from sfm_app.selfcal.pairs import (
     prepare,
     write_camera,
 )
-from sfm_app.selfcal.priors import PRIORS, CameraPriors, TiedPriors
+from sfm_app.selfcal.priors import PRIORS, CameraPriors, TiedPriors, claim_rows
 from sfm_app.settings import CalibrationSettings
-from sfm_app.types import Calibration, CameraPairs
+from sfm_app.types import Calibration, CameraPairs, CameraPrior
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 LEAST_PAIRS_OF_SEVERAL = 2
@@ -196,8 +196,7 @@ class CameraGroup:
     """Calibration from its own pairs or from splitting its group; None for none."""
     known: bool = False
     """Whether its own pairs determine `start`."""
-    hint_px: float = np.nan
-    """Claimed focal; NaN for none."""
+    prior: CameraPrior | None = None
     family: int = -1
     """Number of the folder whose photos have similar cameras, one each; -1 for none."""
     divided: bool = False
@@ -212,9 +211,9 @@ def calibrate_cameras(
     rows, Fs, matches = _convert_to_units(cameras, pairs, members, unit)
     members, weights, photos = members[rows], pairs.weights[rows], [pairs.photos[k] for k in rows]
     sides = np.array([max(camera.size) / unit for camera in cameras])
-    hints = np.array([camera.hint_px for camera in cameras]) / unit
+    claims = claim_rows([camera.prior for camera in cameras], [camera.size for camera in cameras], unit)
     families = np.array([camera.family for camera in cameras], np.int64)
-    priors = TiedPriors(sides, hints, options.center_sigma, options.lens, families)
+    priors = TiedPriors(sides, claims, options.center_sigma, options.lens, families)
     thetas = np.array(
         [
             [PRIORS.usual_log_focal + np.log(side), 0.0, 0.0, 0.0, 0.0]
@@ -315,9 +314,9 @@ def _find_focals(thetas: FloatArray, unknown: BoolArray, tables: VoteTables, pri
     trials[unknown, :, LOG_FOCAL] = log_focal_grid(GROUPS.focals) + np.log(priors.sides[unknown])[:, None]
     usual = trials[..., LOG_FOCAL] - np.log(priors.sides)[:, None] - PRIORS.usual_log_focal
     own = -0.5 * (usual / PRIORS.focal_spread) ** 2
-    hinted = np.isfinite(priors.hints)
-    off = (trials[hinted, :, LOG_FOCAL] - np.log(priors.hints[hinted])[:, None]) / PRIORS.hint_spread
-    own[hinted] += np.exp(-0.5 * off**2)
+    claimed = priors.claims_focal
+    mean, deviation = priors.claims[:, claimed, LOG_FOCAL, None]
+    own[claimed] += np.exp(-0.5 * ((trials[claimed, :, LOG_FOCAL] - mean) / deviation) ** 2)
     votes = (
         (i, j, tables.votes(pair, trials[i], trials[j], CONSENSUS.sigmas[0]))
         for pair, (i, j) in enumerate(tables.members)

@@ -10,8 +10,9 @@ from sfm_app.camera.models import camera_matrix, guessed_camera_matrix
 from sfm_app.camera.projection import BEARING, fold_radius, unproject_point
 from sfm_app.camera.rows import CX, CY, FX, FY, K1, PERSPECTIVE
 from sfm_app.jit import kernel
-from sfm_app.types import Calibration, CameraPairs
+from sfm_app.types import Calibration, CameraPairs, CameraPrior
 from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.camera import CLAIM
 
 # The input of every calibrator: checked, of rank 2, in image units (thesis 5.6.4; rank 2 and epipoles are ours).
 
@@ -84,8 +85,8 @@ def check_pairs(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, IndexArray]
     """Return matrices (Q, 3, 3), weights (Q,) and rows of the pairs with a weight.
 
     Raises:
-        ValueError: a shape is wrong, a number is not finite, a weight is negative, an F is zero, or the size or a
-            claimed focal is not positive.
+        ValueError: a shape is wrong, a number is not finite, a weight is negative, an F is zero, or the size is not
+            positive.
     """
     raw = np.asarray(pairs.Fs, dtype=np.float64)
     trust = np.asarray(pairs.weights, dtype=np.float64)
@@ -115,8 +116,6 @@ def _check_photos(pairs: CameraPairs, count: int) -> None:
             raise ValueError(f"there are {count} fundamental matrices, but {name} of {len(values)} pairs")
     if any(x.ndim != 2 or x.shape[1] != 4 or not np.all(np.isfinite(x)) for x in map(np.asarray, pairs.inliers)):
         raise ValueError("inliers must have shape (N, 4) per pair and be finite")
-    if not all(np.isfinite(focal) and focal > 0 for focal in pairs.focal_hints_px):
-        raise ValueError("claimed focals must be finite and > 0")
 
 
 def _distinct_indices(scaled: FloatArray) -> IndexArray:
@@ -177,6 +176,23 @@ def guess_calibration(size: tuple[int, int], reason: str, evidence: Mapping[str,
     """Return the usual guess, with the reason for the user and the evidence."""
     K = guessed_camera_matrix(size)
     return Calibration(K, *size, GUESS, identifiable=False, reason=reason, evidence=dict(evidence))
+
+
+def claimed_calibration(
+    prior: CameraPrior, size: tuple[int, int], reason: str, evidence: Mapping[str, float]
+) -> Calibration:
+    """Return the camera that someone claims, with the reason why the pairs do not determine it."""
+    K = guessed_camera_matrix(size, prior.focal_px)
+    spread = dict.fromkeys(("fx", "fy"), prior.focal_deviation_px)
+    if prior.center_px is not None:
+        K[:2, 2] = prior.center_px
+        spread |= dict.fromkeys(("cx", "cy"), prior.center_deviation_px)
+    if prior.k1 is not None:
+        spread["k1"] = prior.k1_deviation
+    return Calibration(
+        K, *size, CLAIM, identifiable=False, reason=f"{reason}; {prior.source} claims this one".removeprefix("; "),
+        distortion=(prior.k1 or 0.0,), spread=spread, evidence=dict(evidence),
+    )  # fmt: skip
 
 
 def calibration_from_parameters(

@@ -11,7 +11,6 @@ from itertools import chain, count
 
 import numpy as np
 
-from sfm_app.camera.models import guessed_camera_matrix
 from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.selfcal.calibrate_pairs import undistort_pairs
 from sfm_app.selfcal.consensus import Consensus
@@ -22,6 +21,7 @@ from sfm_app.selfcal.pairs import (
     KAPPA,
     LOG_FOCAL,
     calibration_from_parameters,
+    claimed_calibration,
     downgrade_to_estimate,
     guess_calibration,
     parameters_from_calibration,
@@ -202,7 +202,7 @@ def _calibrate_from_all_pairs(
             size=pairs.sizes[camera.photos[0]],
             start=camera.found if camera.found.identifiable else None,
             known=camera.found.identifiable and bool(camera.found.evidence),
-            hint_px=_claimed_focal(camera, pairs),
+            prior=pairs.prior_of(camera.photos),
             family=camera.family,
             divided=camera.divided,
         )
@@ -213,18 +213,11 @@ def _calibrate_from_all_pairs(
 
 
 def _fall_back_to_guess(camera: CalibratedCamera, pairs: PhotoPairs) -> Calibration:
-    """Return the calibration; for a guess, a K to start from: EXIF's claim, or 1.2 x the longer side."""
+    """Return the calibration; for a guess, the camera that someone claims, or a focal of 1.2 x the longer side."""
     calibration = camera.found
     if calibration.identifiable or calibration.method == ESTIMATE:
         return calibration
-    claim = _claimed_focal(camera, pairs)
-    size = pairs.sizes[camera.photos[0]]
-    if not np.isfinite(claim):
-        return calibration if camera.family >= 0 else guess_calibration(size, calibration.reason, calibration.evidence)
-    K = guessed_camera_matrix(size, claim)
-    return replace(calibration, K=K, method="exif", distortion=(), spread={}, correlations={}, held=())
-
-
-def _claimed_focal(camera: CalibratedCamera, pairs: PhotoPairs) -> float:
-    claims = [pairs.focal_hints_px[photo] for photo in camera.photos if photo in pairs.focal_hints_px]
-    return float(np.median(claims)) if claims else float("nan")
+    prior, size = pairs.prior_of(camera.photos), pairs.sizes[camera.photos[0]]
+    if prior is not None:
+        return claimed_calibration(prior, size, calibration.reason, calibration.evidence)
+    return calibration if camera.family >= 0 else guess_calibration(size, calibration.reason, calibration.evidence)

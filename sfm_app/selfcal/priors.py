@@ -3,10 +3,12 @@
 Ours; the choice by marginal likelihood is that of `geometry.least_squares`. Most photos are uncropped, their pixels
 square, their lens nearly straight; some are not. So center, aspect and lens each have two priors: a narrow one about
 the usual value, and a wide one. A parameter is freed only where the evidence for the wide prior outweighs how rare such
-photos are; otherwise it stays near its usual value. A focal that EXIF claims is one more narrow prior, which loses
-against pairs that contradict it. Where photos of one folder have a camera each, a hierarchical prior ties their focals.
+photos are; otherwise it stays near its usual value. A claim about a camera is the narrow prior in place of the usual
+one, and loses against pairs that contradict it. Where photos of one folder have a camera each, a hierarchical prior
+ties their focals.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,12 +25,14 @@ from sfm_app.geometry.least_squares import (
 )
 from sfm_app.selfcal.adjustment import CAMERA, Prior
 from sfm_app.selfcal.pairs import CENTER_U, KAPPA, LOG_ASPECT, LOG_FOCAL
+from sfm_app.types import CameraPrior
 from sfm_app.types.arrays import BoolArray, FloatArray
 
 NAMES = ("center", "aspect", "k1", "focal")
 """Names of the parts in `Calibration.held`."""
 COLUMNS = {CENTER: [CENTER_U, CENTER_U + 1], ASPECT: [LOG_ASPECT], LENS: [KAPPA]}
 """Columns of each part in the parameters of a camera, by definition in `pairs`."""
+PART_OF_COLUMN = [FOCAL, CENTER, CENTER, ASPECT, LENS]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +43,6 @@ class PriorOptions:
     """Mean of log f, f in longer sides, without a claimed focal: COLMAP's guess."""
     focal_spread: float = 0.7
     """Standard deviation of log f without a claimed focal, a factor of two; by hand."""
-    hint_spread: float = 0.05
-    """Standard deviation of the logarithm of a claimed focal: EXIF rounds millimeters and sensor sizes; by hand."""
     family_spread: float = 0.3
     """Standard deviation of log f among photos of one folder; chosen on reichstag10 and random scenes."""
     undetermined: float = 0.5
@@ -57,41 +59,67 @@ class PriorOptions:
 PRIORS = PriorOptions()
 
 
+def claim_rows(priors: Sequence[CameraPrior | None], sizes: Sequence[tuple[int, int]], unit_px: float) -> FloatArray:
+    """Return the `claims` of `CameraPriors` in units from the middles of photos of these sizes."""
+    rows = np.full((2, len(priors), CAMERA), np.nan)
+    for k, (prior, size) in enumerate(zip(priors, sizes, strict=True)):
+        if prior is None:
+            continue
+        rows[:, k, LOG_FOCAL] = np.log(prior.focal_px / unit_px), prior.focal_deviation_px / prior.focal_px
+        if prior.center_px is not None:
+            center = [CENTER_U, CENTER_U + 1]
+            rows[0, k, center] = (np.array(prior.center_px) - np.array(size) / 2) / unit_px
+            rows[1, k, center] = prior.center_deviation_px / unit_px
+        if prior.k1 is not None:
+            rows[:, k, KAPPA] = prior.k1, prior.k1_deviation
+    return rows
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPriors:
     """Priors on the cameras, one row each."""
 
     sides: FloatArray
     """(C,) longer side of the photos, in the units of the matches."""
-    hints: FloatArray
-    """(C,) claimed focal in the same units, NaN where nobody claims one."""
+    claims: FloatArray
+    """(2, C, 5) claimed parameters as in `pairs`, and their deviations, but k1 for kappa; NaN without a claim."""
     center_sigma: float = WIDE[CENTER]
     """Wide prior on the center, in longer sides."""
     lens: bool = True
 
     def prior(self, free: BoolArray, thetas: FloatArray, held: BoolArray | None = None) -> Prior:
         """Return the prior for freed parts (C, 4) and those `held` at usual values; thetas convert k1 to kappa."""
-        mean, deviation = np.zeros((len(self.sides), CAMERA)), np.empty((len(self.sides), CAMERA))
-        hinted = ~free[:, FOCAL] & np.isfinite(self.hints)
-        with np.errstate(invalid="ignore"):
-            mean[:, LOG_FOCAL] = np.where(hinted, np.log(self.hints), PRIORS.usual_log_focal + np.log(self.sides))
-        deviation[:, LOG_FOCAL] = np.where(hinted, PRIORS.hint_spread, PRIORS.focal_spread)
-        wide = self.center_sigma
-        deviation[:, CENTER_U : CENTER_U + 2] = (np.where(free[:, CENTER], wide, NARROW[CENTER]) * self.sides)[:, None]
-        deviation[:, LOG_ASPECT] = np.where(free[:, ASPECT], WIDE[ASPECT], NARROW[ASPECT])
-        k1 = np.where(free[:, LENS], WIDE[LENS], NARROW[LENS]) if self.lens else PRIORS.held_factor * NARROW[LENS]
-        deviation[:, KAPPA] = k1 / np.exp(2.0 * thetas[:, LOG_FOCAL])
+        freed = free[:, PART_OF_COLUMN]
+        usual = np.zeros(freed.shape)
+        usual[:, LOG_FOCAL] = PRIORS.usual_log_focal + np.log(self.sides)
+        across = self.sides[:, None] * [0, 1, 1, 0, 0] + [1, 0, 0, 1, 1]
+        center, k1 = NARROW[CENTER], NARROW[LENS] if self.lens else PRIORS.held_factor * NARROW[LENS]
+        narrow = across * [PRIORS.focal_spread, center, center, NARROW[ASPECT], k1]
+        center, k1 = self.center_sigma, WIDE[LENS] if self.lens else k1
+        wide = across * [PRIORS.focal_spread, center, center, WIDE[ASPECT], k1]
+        claimed = np.isfinite(self.claims[0]) & ~freed
+        claimed[:, KAPPA] &= self.lens
+        mean = np.where(claimed, self.claims[0], usual)
+        deviation = np.where(claimed, self.claims[1], np.where(freed, wide, narrow))
+        per_kappa = np.exp(2.0 * thetas[:, LOG_FOCAL])
+        mean[:, KAPPA] /= per_kappa
+        deviation[:, KAPPA] /= per_kappa
         if held is not None:
             for place, columns in COLUMNS.items():
                 for column in columns:
                     deviation[held[:, place], column] *= PRIORS.held_factor
         return Prior(mean, deviation**-2.0)
 
+    @property
+    def claims_focal(self) -> BoolArray:
+        """(C,) whether somebody claims the focal."""
+        return np.isfinite(self.claims[0, :, LOG_FOCAL])
+
     def log_odds(self, free: BoolArray) -> float:
         """Return the prior log-probability of a choice (C, 4)."""
         total = 0.0
         for place, share in FREE_SHARE.items():
-            counts = np.isfinite(self.hints) if place == FOCAL else np.ones(len(self.sides), np.bool_)
+            counts = self.claims_focal if place == FOCAL else np.ones(len(self.sides), np.bool_)
             freed = share if place != LENS or self.lens else PRIORS.held_factor
             total += float(np.sum(np.log(np.where(free[counts, place], freed, 1.0 - freed))))
         return total
@@ -200,7 +228,7 @@ class TiedPriors(CameraPriors):
         """Return the prior; the mean of a family is that of its cameras, shrunk towards the usual focal."""
         plain = CameraPriors.prior(self, free, thetas, held)
         mean, precision = plain.mean.copy(), plain.precision.copy()
-        claimed = ~free[:, FOCAL] & np.isfinite(self.hints)
+        claimed = ~free[:, FOCAL] & self.claims_focal
         for family in np.unique(self.families[self.families >= 0]):
             members = np.flatnonzero(self.families == family)
             if len(members) < 2:  # a single photo has no others to follow

@@ -44,7 +44,7 @@ from sfm_app.selfcal.pairs import (
     prepare,
     sides_from_pixels,
 )
-from sfm_app.selfcal.priors import PRIORS, CameraPriors
+from sfm_app.selfcal.priors import PRIORS, CameraPriors, claim_rows
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
 from sfm_app.types.arrays import FloatArray, IndexArray
@@ -121,8 +121,7 @@ def _calibrate_from_matches(
     """Adjust the camera to the matches from the consensus; a consensus of undistorted pairs then judges it."""
     side = float(max(pairs.size))
     sigma = options.center_sigma * pairs.size[0] / side
-    hint = float(np.median(pairs.focal_hints_px)) / side if pairs.focal_hints_px else np.nan
-    priors = CameraPriors(np.ones(1), np.array([hint]), sigma, options.lens)
+    priors = CameraPriors(np.ones(1), claim_rows([pairs.prior], [pairs.size], side), sigma, options.lens)
     adjusted = _adjust(pairs, usable, priors)
     if adjusted.is_contradicted:
         adjusted = max(adjusted, _adjust(pairs, usable, priors, adjusted), key=lambda one: one.vote_share)
@@ -191,7 +190,8 @@ def _adjust(pairs: CameraPairs, usable: Pairs, priors: CameraPriors, before: _Ad
     if before is None:
         first, rows = find_peak(Consensus(usable, priors.center_sigma)), _subsample(len(usable))
         plain = np.array([PRIORS.usual_log_focal, 0.0, 0.0, 0.0])
-        starts = [np.append(theta, 0.0)[None] for theta in (first.theta, *first.rivals[:1], plain)]
+        claimed = [np.append(priors.claims[0, 0, :1], plain[1:])] if priors.claims_focal[0] else []
+        starts = [np.append(theta, 0.0)[None] for theta in (first.theta, *first.rivals[:1], plain, *claimed)]
     else:
         first, rows = before.peak, before.agreeing_pairs[_subsample(len(before.agreeing_pairs))]
         starts = [np.append(first.theta, before.fit.state.thetas[0, KAPPA])[None]]

@@ -8,8 +8,9 @@ from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.bundle import Adjustment, adjust_or_keep
 from sfm_app.colmap.model import color_points, posed_images, posed_photo_ids, read_scene
 from sfm_app.errors import ReconstructionError
+from sfm_app.estimation.claims import camera_rules, refined_claims, report_claims
 from sfm_app.estimation.diagnosis import diagnose_depth, diagnose_scene
-from sfm_app.estimation.given_cameras import camera_rules, given_and_found, refined_claims, report_checks, report_claims
+from sfm_app.estimation.given_cameras import given_and_found, report_checks
 from sfm_app.files import mark_unfinished, resume_or_clear
 from sfm_app.frame.upright import gps_deviation, orient_or_keep, submit_cue_extraction
 from sfm_app.mapping.attempt import unregistered_reasons
@@ -56,7 +57,10 @@ def _adjust_models(
 ) -> tuple[list[Adjustment], dict[str, Json]]:
     """Return the adjusted models, and the manifest's entry about the rolling shutter of the first, if it has one."""
     database, family = outcome.run.workspace.database, run.settings.scene.camera_model
-    rules = [camera_rules(attempt.model, names, outcome.calibrated, family) for attempt in outcome.models]
+    rules = [
+        camera_rules(attempt.model, names, outcome.calibrated, outcome.evidence.matches, family)
+        for attempt in outcome.models
+    ]
     tries = run.settings.scene.tries
     with run.step("adjusting all cameras"):
         adjusted = [

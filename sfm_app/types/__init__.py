@@ -23,6 +23,7 @@ from sfm_app.types.evidence import (
     ViewGraph,
 )
 from sfm_app.types.photos import (
+    CameraPrior,
     Features,
     Frame,
     GpsPosition,
@@ -40,6 +41,7 @@ __all__ = [
     "Calibration",
     "CameraModel",
     "CameraPairs",
+    "CameraPrior",
     "ControlPoint",
     "ControlPoints",
     "EpipolarFit",

@@ -13,8 +13,9 @@ from sfm_app.types.photos import MatchedImage, PairId, Photo
 
 PERSPECTIVE, FISHEYE, EQUIRECTANGULAR = "perspective", "fisheye", "equirectangular"
 PROJECTIONS = (PERSPECTIVE, FISHEYE, EQUIRECTANGULAR)
-GIVEN, KEPT = "given", "kept"
-"""Methods of cameras from a calibration file: refined, and kept unchanged."""
+GIVEN, KEPT, CLAIM = "given", "kept", "claim"
+"""Methods of cameras from a calibration file: refined, and kept unchanged; and of a `CameraPrior` where the photos do
+not determine the camera."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,8 +27,8 @@ class Calibration:
     width: int
     height: int
     method: str
-    """Name of the calibrator; "estimate" where the photos determine K roughly; "exif" or "guess" for a guess; `GIVEN`
-    or `KEPT` where the user gave it."""
+    """Name of the calibrator; "estimate" where the photos determine K roughly; `CLAIM` or "guess" where they do not;
+    `GIVEN` or `KEPT` where the user gave it."""
     identifiable: bool
     """False when the fundamental matrices do not determine K; K is then a guess."""
     reason: str = ""
@@ -54,6 +55,11 @@ class Calibration:
     def is_estimated(self) -> bool:
         """Whether mapping may build on K: the photos determine it, at least roughly."""
         return self.identifiable or self.method == "estimate"
+
+    @property
+    def is_claimed(self) -> bool:
+        """Whether K is a claim, which the photos neither confirm nor contradict."""
+        return self.method == CLAIM
 
     @property
     def is_given(self) -> bool:

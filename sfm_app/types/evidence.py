@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from sfm_app.numerical import json_text
 from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import Calibration, Intrinsics
-from sfm_app.types.photos import MatchGraph, PairId
+from sfm_app.types.photos import CameraPrior, MatchGraph, PairId, join_priors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,8 +148,7 @@ class CameraPairs:
     """Per pair the ids of its two photos; empty where they are unknown."""
     inliers: tuple[NDArray[np.float64], ...] = ()
     """Per pair (N, 4) x1, y1, x2, y2 in pixels: the matches behind F; empty where only the Fs are known."""
-    focal_hints_px: tuple[float, ...] = field(default=())
-    """Focal lengths claimed by EXIF, in pixels, one per photo that has one; hints, never trusted."""
+    prior: CameraPrior | None = None
 
     @classmethod
     def from_Fs(cls, Fs: ArrayLike, size: tuple[int, int], weights: ArrayLike | None = None) -> "CameraPairs":
@@ -173,8 +172,8 @@ class PhotoPairs:
     """(width, height) in pixels by photo."""
     groups: Mapping[int, str]
     """By photo the group that is assumed to share one camera."""
-    focal_hints_px: Mapping[int, float] = field(default_factory=dict)
-    """Claimed focal (EXIF) by photo, where there is one."""
+    priors: Mapping[int, CameraPrior] = field(default_factory=dict)
+    """Claim about the camera by photo, where there is one."""
     padded_sizes: Mapping[int, tuple[int, int]] = field(default_factory=dict)
     """By photo with bars the size including the bars; `sizes` then has that of the picture inside them. Photos that
     bars bring to one size may each be of another camera."""
@@ -188,7 +187,12 @@ class PhotoPairs:
         moves[:, :, :2, 2] = at
         Fs = moves[:, 1].transpose(0, 2, 1) @ self.Fs @ moves[:, 0]
         inliers = tuple(x - corner.reshape(4) for x, corner in zip(self.inliers, at, strict=True))
-        return replace(self, Fs=Fs, inliers=inliers)
+        priors = {photo: prior.move(*corners.get(photo, (0, 0))) for photo, prior in self.priors.items()}
+        return replace(self, Fs=Fs, inliers=inliers, priors=priors)
+
+    def prior_of(self, members: Collection[int]) -> CameraPrior | None:
+        """Return the claim about the camera of some photos; None without any."""
+        return join_priors([self.priors[photo] for photo in sorted(members) if photo in self.priors])
 
     def to_camera_pairs(self, members: Collection[int]) -> CameraPairs:
         """Return the pairs whose photos are both members; all members have one size."""
@@ -200,7 +204,7 @@ class PhotoPairs:
             size=self.sizes[min(ids)],
             photos=tuple(self.photos[k] for k in rows),
             inliers=tuple(self.inliers[k] for k in rows),
-            focal_hints_px=tuple(self.focal_hints_px[photo] for photo in sorted(ids) if photo in self.focal_hints_px),
+            prior=self.prior_of(ids),
         )
 
 

@@ -1,7 +1,7 @@
 """Photos, their features and their raw matches."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,70 @@ from numpy.typing import NDArray
 
 Frame = tuple[int, int, int, int]
 """Left, top, width and height of a part of a photo, in pixels."""
+
+
+EXIF = "EXIF"
+
+
+@dataclass(frozen=True, slots=True)
+class CameraPrior:
+    """Claim of EXIF, of a plug-in or of the user about the camera of a photo, with standard deviations; never trusted.
+
+    Pixels are those of the photo, in the orientation of its sensor.
+    """
+
+    source: str
+    """Name for people, such as "EXIF"."""
+    focal_px: float
+    focal_deviation_px: float
+    center_px: tuple[float, float] | None = None
+    """Principal point; None for no claim."""
+    center_deviation_px: float = 0.0
+    """Of each coordinate."""
+    k1: float | None = None
+    """Radial distortion of COLMAP's SIMPLE_RADIAL; None for no claim."""
+    k1_deviation: float = 0.0
+
+    def __post_init__(self) -> None:
+        deviations = [self.focal_deviation_px]
+        if self.center_px is not None:
+            deviations.append(self.center_deviation_px)
+        if self.k1 is not None:
+            deviations.append(self.k1_deviation)
+        values = np.array([self.focal_px, *(self.center_px or ()), self.k1 or 0.0, *deviations], np.float64)
+        if not (np.isfinite(values).all() and self.focal_px > 0.0 and min(deviations) > 0.0):
+            raise ValueError("claims must be finite, and the focal length and every deviation > 0")
+
+    def move(self, left: float, top: float) -> "CameraPrior":
+        """Return the claim in pixels that count from another origin."""
+        center = self.center_px and (self.center_px[0] - left, self.center_px[1] - top)
+        return replace(self, center_px=center)
+
+
+def join_priors(priors: Sequence[CameraPrior]) -> CameraPrior | None:
+    """Return the claim about a camera from those about its photos: medians, whose errors do not average out.
+
+    Deviations cover the scatter between the photos.
+    """
+    if not priors:
+        return None
+    focal_px, focal_deviation_px = _median([(one.focal_px, one.focal_deviation_px) for one in priors])
+    joined = CameraPrior(priors[0].source, focal_px, focal_deviation_px)
+    if centers := [(*one.center_px, one.center_deviation_px) for one in priors if one.center_px is not None]:
+        (x, across), (y, down) = (_median([(one[axis], one[2]) for one in centers]) for axis in (0, 1))
+        joined = replace(joined, center_px=(x, y), center_deviation_px=max(across, down))
+    if terms := [(one.k1, one.k1_deviation) for one in priors if one.k1 is not None]:
+        k1, k1_deviation = _median(terms)
+        joined = replace(joined, k1=k1, k1_deviation=k1_deviation)
+    return joined
+
+
+def _median(claims: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Return the median of values, and the larger of their median deviation and of their own scatter."""
+    values, deviations = np.array(claims, np.float64).T
+    middle = float(np.median(values))
+    scatter = 1.4826 * float(np.median(np.abs(values - middle)))  # the deviation of normal errors
+    return middle, max(float(np.median(deviations)), scatter)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +99,7 @@ class Photo:
     height: int
     group: str
     """Photos of one group share one camera."""
-    exif_focal_px: float | None = None
-    """Focal length that EXIF claims, in pixels of this photo; a hint, never trusted."""
+    prior: CameraPrior | None = None
     needs_copy: bool = False
     """True where COLMAP cannot read the file as it is (orientation, palette, 16 bit, format, size)."""
     gps: GpsPosition | None = None
@@ -68,10 +131,13 @@ class Photo:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Photo":
-        """Return the photo from the values of `to_dict`."""
-        gps, shown = values.get("gps"), values.get("shown")
-        known = {"gps": GpsPosition(**gps) if gps else None, "shown": tuple(shown) if shown else None}
-        return cls(**{**values, **known, "notes": tuple(values.get("notes", ()))})
+        """Return the photo from the values of `to_dict`; entries of other names are left out."""
+        gps, shown, prior = values.get("gps"), values.get("shown"), values.get("prior")
+        known: dict[str, Any] = {"gps": GpsPosition(**gps) if gps else None, "shown": tuple(shown) if shown else None}
+        if prior:
+            known["prior"] = CameraPrior(**{**prior, "center_px": prior["center_px"] and tuple(prior["center_px"])})
+        same = {one.name: values[one.name] for one in fields(cls) if one.name in values}
+        return cls(**{**same, **known, "notes": tuple(values.get("notes", ()))})
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +198,7 @@ class MatchedImage:
     group: str
     width: int
     height: int
-    exif_focal_px: float | None = None
+    prior: CameraPrior | None = None
     gps: GpsPosition | None = None
     turn_deg: int = 0
     """Clockwise rotation that makes it upright, according to EXIF and its shape."""

@@ -15,7 +15,7 @@ from sfm_app.plugins import load_plugins
 from sfm_app.selfcal import calibrate_photo_set, pair_weights, photo_set, zero_curves
 from sfm_app.settings import CalibrationSettings, ConstraintForm
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
-from sfm_app.types import Calibration, CameraPairs, PhotoPairs
+from sfm_app.types import Calibration, CameraPairs, CameraPrior, PhotoPairs
 
 CALIBRATORS = load_plugins().calibrators
 OPTIONS = CalibrationSettings()
@@ -255,7 +255,7 @@ HOSTILE = {
     "a view of a hundredth of a degree": lambda p: each(p, lambda x: 1e-4 * x + 0.9999 * np.tile([500, 375], 2)),
     "rank one and the rest": lambda p: replace(p, Fs=np.concatenate([np.ones((3, 3, 3)), p.Fs[3:]])),
     "all but the same weight": lambda p: replace(p, weights=np.geomspace(1e-300, 1.0, len(p.Fs))),
-    "absurd claims": lambda p: replace(p, focal_hints_px=(1e-12, 1e12, 1e12)),
+    "absurd claims": lambda p: replace(p, prior=CameraPrior("a net", 1e12, 1e-3, (-1e9, 1e9), 1e-3, 9.0, 1e-6)),
 }  # fmt: skip
 
 
@@ -282,13 +282,10 @@ def test_hostile_matches_never_raise(calibrate, case):
     lambda p: first(p, lambda x: x[0]),
     lambda p: first(p, lambda x: x * np.nan),
     lambda p: first(p, lambda x: x * np.inf),
-    lambda p: replace(p, focal_hints_px=(1000.0, np.nan)),
-    lambda p: replace(p, focal_hints_px=(-5.0,)),
-    lambda p: replace(p, focal_hints_px=(0.0,)),
     lambda p: replace(p, photos=p.photos[1:]),
 ])  # fmt: skip
-def test_malformed_matches_and_claims_are_refused(calibrate, change):
-    with pytest.raises(ValueError, match=r"inliers|focals|photos|finite"):
+def test_malformed_matches_are_refused(calibrate, change):
+    with pytest.raises(ValueError, match=r"inliers|photos|finite"):
         calibrate(change(matched(1)), OPTIONS, 0)
 
 
@@ -335,7 +332,7 @@ def test_hostile_sets_of_several_cameras_never_raise(case, grouping, monkeypatch
     photo_pairs = PhotoPairs(
         pairs.Fs, pairs.weights, pairs.photos, pairs.inliers,
         sizes=dict.fromkeys(photos, SIZE), groups={photo: GROUPINGS[grouping](photo) for photo in photos},
-        focal_hints_px=dict.fromkeys(photos, pairs.focal_hints_px[0]) if pairs.focal_hints_px else {},
+        priors=dict.fromkeys(photos, pairs.prior) if pairs.prior else {},
     )  # fmt: skip
     found = calibrate_photo_set(photo_pairs, zero_curves.calibrate, OPTIONS, 0, together=True)
     assert sorted(photo for camera in found for photo in camera.photos) == list(photos)

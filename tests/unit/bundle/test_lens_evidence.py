@@ -51,9 +51,9 @@ def starting_at(bundle, *params):
 
 
 def asked(bundle, *cameras):
-    """All about some cameras, of others only k1."""
-    only_k1 = np.array([name == "k1" for name in NAMES])
-    rows = np.array([only_k1 | bool(all_of) for all_of in cameras])
+    """All about some cameras, of others only focal and k1."""
+    always = np.array([name in ("focal", "k1") for name in NAMES])
+    rows = np.array([always | bool(all_of) for all_of in cameras])
     return LensPriors.from_cameras(bundle.params, bundle.family, np.tile(SIZE, (len(rows), 1)), rows)
 
 

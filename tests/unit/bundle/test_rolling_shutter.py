@@ -228,7 +228,7 @@ def test_priors_hold_what_they_are_sure_of(model):
     assert held.deviation < free.deviation
 
 
-ALL = np.array([[True] * 5 + [False] * 2])
+ALL = np.array([[True] * 5 + [False] * 2 + [True]])
 
 
 def priors(bundle):

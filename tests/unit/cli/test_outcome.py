@@ -190,7 +190,7 @@ def test_a_warning_of_a_contradicted_camera_has_both_numbers():
     assert contradiction_lines({}) == []
     assert contradiction_lines({"given_camera_notes": ["it is scaled"]}) == ["it is scaled"]
     claims = {"a": {"text": "EXIF says 9 px"}, "b": {"contradicted": False}}
-    assert contradiction_lines({"exif_focals": claims}) == ["a: EXIF says 9 px"]
+    assert contradiction_lines({"camera_claims": claims}) == ["a: EXIF says 9 px"]
 
 
 def test_a_guess_is_marked_right_after_its_figures():

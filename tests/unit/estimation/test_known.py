@@ -17,6 +17,7 @@ from sfm_app.selfcal import CalibratedCamera
 from sfm_app.settings import Settings
 from sfm_app.types import (
     Calibration,
+    CameraPrior,
     EpipolarFit,
     GivenCameras,
     Intrinsics,
@@ -109,7 +110,14 @@ KNOWN = ("a", "b", "c", "d")
 
 def photo_graph(*names, group="one", exif=None):
     images = {
-        k: MatchedImage(k, name, group, 1000, 750, exif_focal_px=None if name in KNOWN else exif)
+        k: MatchedImage(
+            k,
+            name,
+            group,
+            1000,
+            750,
+            prior=None if name in KNOWN or not exif else CameraPrior("EXIF", exif, 0.04 * exif),
+        )
         for k, name in enumerate(names, start=1)
     }
     return MatchGraph(images, {k: np.zeros((0, 2)) for k in images}, {})

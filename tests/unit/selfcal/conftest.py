@@ -36,10 +36,10 @@ class Shots:
     Ks: NDArray[np.float64]
     sizes: Mapping[int, tuple[int, int]] = field(default_factory=dict)
 
-    def as_set(self, groups, hints=None):
+    def as_set(self, groups, priors=None):
         """`PhotoPairs` with the group of every photo."""
         p = self.pairs
-        return PhotoPairs(p.Fs, p.weights, p.photos, p.inliers, self.sizes, dict(enumerate(groups)), hints or {})
+        return PhotoPairs(p.Fs, p.weights, p.photos, p.inliers, self.sizes, dict(enumerate(groups)), priors or {})
 
 
 def looking(center, target, roll):
@@ -168,7 +168,7 @@ def shots():
 
     def make(
         count=6, seed=0, *, motion=free_motion, focal=1000.0, aspect=1.0, center=(0.5, 0.5), size=(1000, 750), k1=0.0,
-        noise_px=0.5, points=250, hints=(),
+        noise_px=0.5, points=250, prior=None,
     ):  # fmt: skip
         sizes, root = [size] * count if isinstance(size[0], int) else list(size), np.sqrt(aspect)
         Ks = np.array(
@@ -177,7 +177,7 @@ def shots():
         )  # fmt: skip
         Fs, ids, inliers = match(motion, seed, points, Ks, sizes, k1, noise_px)
         weights = pair_weights([len(x) for x in inliers])
-        return Shots(CameraPairs(Fs, weights, sizes[0], ids, inliers, tuple(hints)), Ks, dict(enumerate(sizes)))
+        return Shots(CameraPairs(Fs, weights, sizes[0], ids, inliers, prior), Ks, dict(enumerate(sizes)))
 
     make.free, make.orbit, make.level = free_motion, orbit, level
     make.parallel, make.turning, make.onward = parallel, turning, onward

@@ -38,7 +38,7 @@ def laid_out(pairs, **options):
 
 
 def fitted(pairs, start=(0.0, 0.0, 0.0, 0.0, 0.0)):
-    return fit_cameras(*laid_out(pairs), [np.array([start])], CameraPriors(np.ones(1), np.array([np.nan])))
+    return fit_cameras(*laid_out(pairs), [np.array([start])], CameraPriors(np.ones(1), np.full((2, 1, 5), np.nan)))
 
 
 def scores(found, K, k1):
@@ -136,7 +136,7 @@ def test_noise_of_few_matches_is_not_underestimated(shots):
         made = shots(6, seed, points=250).pairs
         few = replace(made, inliers=tuple(subsample_rows(x, 16) for x in made.inliers))
         matches, Fs = laid_out(few)
-        fit = fit_cameras(matches, Fs, [np.zeros((1, 5))], CameraPriors(np.ones(1), np.array([np.nan])))
+        fit = fit_cameras(matches, Fs, [np.zeros((1, 5))], CameraPriors(np.ones(1), np.full((2, 1, 5), np.nan)))
         ratios.append(fit.state.sigma * SIDE / 0.5)
     assert 0.72 < np.mean(ratios) < 1.1
 

@@ -9,7 +9,7 @@ from sfm_app.selfcal import calibrate_photo_set, photo_set
 from sfm_app.selfcal.pairs import guess_calibration
 from sfm_app.selfcal.zero_curves import calibrate
 from sfm_app.settings import CalibrationSettings
-from sfm_app.types import PhotoPairs
+from sfm_app.types import CameraPrior, PhotoPairs
 
 pytestmark = pytest.mark.slow
 
@@ -27,11 +27,11 @@ def unknown(pairs, options, seed):
     return guess_calibration(pairs.size, "an orbit", {})
 
 
-def alone(count, size=(1000, 750), hints=None):
+def alone(count, size=(1000, 750), priors=None):
     """Photos of one group without any pair."""
     return replace(
         NO_PAIRS, sizes=dict.fromkeys(range(count), size), groups=dict.fromkeys(range(count), "one"),
-        focal_hints_px=hints or {},
+        priors=priors or {},
     )  # fmt: skip
 
 
@@ -60,14 +60,24 @@ def test_two_cameras_without_pairs_have_the_usual_guess_too():
 
 @pytest.mark.parametrize("together", [True, False])
 def test_a_claim_comes_before_a_guess(together):
-    (camera,) = cameras_of(alone(4, hints={1: 900.0, 2: 910.0, 3: 5000.0}), together)
-    assert (camera.found.method, camera.found.focal_px) == ("exif", pytest.approx(910))
-    assert (camera.found.identifiable, camera.found.radial, camera.found.spread) == (False, 0.0, {})
+    claims = [CameraPrior("EXIF", focal, 40.0, (480.0, 375.0), 9.0) for focal in (900.0, 910.0, 5000.0)]
+    (camera,) = cameras_of(alone(4, priors=dict(enumerate(claims))), together)
+    assert (camera.found.method, camera.found.focal_px) == ("claim", pytest.approx(910))
+    assert (camera.found.identifiable, camera.found.K[0, 2]) == (False, 480.0)
+    assert camera.found.spread == {"fx": 40.0, "fy": 40.0, "cx": 9.0, "cy": 9.0}
+    assert camera.found.reason == "0 usable pairs, 3 are needed; EXIF claims this one"
+
+
+def test_the_deviation_of_a_claim_covers_the_scatter_between_photos():
+    claims = [CameraPrior("a net", focal, 10.0) for focal in (800.0, 1000.0, 1300.0)]
+    (camera,) = cameras_of(alone(3, priors=dict(enumerate(claims))))
+    assert camera.found.focal_px == pytest.approx(1000)
+    assert 200 < camera.found.spread["fx"] < 400
 
 
 def test_pairs_come_before_a_wrong_claim(shots):
     made = shots(6, 1)
-    (camera,) = cameras_of(made.as_set(["one"] * 6, dict.fromkeys(range(6), 3000.0)))
+    (camera,) = cameras_of(made.as_set(["one"] * 6, dict.fromkeys(range(6), CameraPrior("a net", 3000.0, 60.0))))
     assert camera.found.identifiable
     assert 0 < abs(camera.found.K[0, 0] - 1000) < 3 * camera.found.spread["fx"] < 30
     assert 0.1 < camera.found.evidence["support"] <= 1
@@ -107,11 +117,11 @@ def test_a_group_without_pairs_beside_one_with(shots):
     pairs = made.as_set(["seen"] * 5)
     pairs = replace(
         pairs, sizes={**pairs.sizes, 5: (400, 300), 6: (400, 300)}, groups={**pairs.groups, 5: "lost", 6: "lost"},
-        focal_hints_px={6: 333.0},
+        priors={6: CameraPrior("EXIF", 333.0, 13.0)},
     )  # fmt: skip
     seen, lost = cameras_of(pairs)
     assert seen.found.identifiable
-    assert (lost.found.method, lost.found.focal_px, lost.photos) == ("exif", pytest.approx(333), (5, 6))
+    assert (lost.found.method, lost.found.focal_px, lost.photos) == ("claim", pytest.approx(333), (5, 6))
     assert "0 usable pairs" in lost.found.reason
 
 

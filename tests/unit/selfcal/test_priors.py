@@ -8,13 +8,20 @@ import pytest
 
 from sfm_app.camera.models import ASPECT, CENTER, FOCAL, LENS, WIDE
 from sfm_app.selfcal import priors
-from sfm_app.selfcal.priors import PRIORS, CameraPriors, Evidence, redundancy
+from sfm_app.selfcal.priors import PRIORS, CameraPriors, Evidence, claim_rows, redundancy
 from sfm_app.selfcal.zero_curves import calibrate
 from sfm_app.settings import CalibrationSettings
+from sfm_app.types import CameraPrior
 
 OPTIONS = CalibrationSettings()
 NOTHING = np.zeros((1, 4), np.bool_)
-NO_CLAIM = np.array([np.nan])
+NO_CLAIM = claim_rows([None], [(1000, 750)], 1000.0)
+
+
+def claimed(focal, deviation=0.05, count=1):
+    """Claims of a focal in longer sides about the first of some cameras."""
+    priors = [CameraPrior("a net", 1000.0 * focal, 1000.0 * focal * deviation)] + [None] * (count - 1)
+    return claim_rows(priors, [(1000, 750)] * count, 1000.0)
 
 
 def freed(*places):
@@ -79,11 +86,11 @@ def test_mean_step_and_covariance_are_those_of_two_measurements():
 
 
 def test_a_claim_counts_where_pairs_are_weak_and_loses_against_strong_ones():
-    claim = np.array([1.0])
+    claim = claimed(1.0)
     weak, strong = evidence([0.3] * 5, (0.1, 0, 0, 0, 0), claim), evidence(SURE, (0.3, 0, 0, 0, 0), claim)
     assert not weak.choose(NOTHING)[0, FOCAL]
     assert abs(weak.posterior(NOTHING)[1][0]) < 0.01
-    assert 0.8 * PRIORS.hint_spread < np.sqrt(weak.covariance(NOTHING)[0, 0]) < 0.3
+    assert 0.8 * 0.05 < np.sqrt(weak.covariance(NOTHING)[0, 0]) < 0.3
     assert strong.choose(NOTHING)[0, FOCAL]
     assert strong.posterior(strong.choose(NOTHING))[1][0] == pytest.approx(0.3, abs=1e-3)
 
@@ -126,7 +133,7 @@ def test_few_pairs_say_less_than_their_scatter():
 def test_every_camera_has_its_own_choice():
     H = np.diag([1e6] * 10)
     g = H @ [0, 0, 0, 0, 0, 0, 0, 0, 0.1, 0]
-    both = Evidence(np.zeros((2, 5)), H, g, 1e6, CameraPriors(np.ones(2), np.full(2, np.nan)))
+    both = Evidence(np.zeros((2, 5)), H, g, 1e6, CameraPriors(np.ones(2), np.full((2, 2, 5), np.nan)))
     np.testing.assert_array_equal(both.choose(np.zeros((2, 4), np.bool_)), np.vstack([NOTHING, freed(ASPECT)]))
 
 
@@ -140,25 +147,27 @@ def test_k1_is_held_in_focal_lengths():
 @pytest.mark.parametrize("claim", [500.0, 850.0, 1180.0, 4000.0])
 def test_a_wrong_claim_does_not_move_the_answer(shots, claim):
     made = shots(6, 3)
-    found = calibrate(replace(made.pairs, focal_hints_px=(claim,) * 6), OPTIONS, 0)
+    found = calibrate(replace(made.pairs, prior=CameraPrior("a net", claim, 0.05 * claim)), OPTIONS, 0)
     assert found.identifiable, found.reason
     assert 0 < abs(found.K[0, 0] - 1000) < 3 * found.spread["fx"] < 20
 
 
 def test_a_right_claim_helps_weak_pairs(shots):
     spreads = []
-    for claims in ((), (1005.0,)):
-        made = shots(4, 0, motion=shots.level, points=80, noise_px=1.0, hints=claims)
+    for prior in (None, CameraPrior("a net", 1005.0, 50.0)):
+        made = shots(4, 0, motion=shots.level, points=80, noise_px=1.0, prior=prior)
         found = calibrate(made.pairs, OPTIONS, 0)
         spreads.append(found.evidence["log_focal_spread"])
     assert spreads[1] < 0.8 * spreads[0]
     assert spreads[1] < 0.08
 
 
-def prior(families, free_focal=False, hints=None, focals=(1.0, 2.0, 4.0)):
+def prior(families, free_focal=False, claims=None, focals=(1.0, 2.0, 4.0)):
     thetas = np.zeros((3, 5))
     thetas[:, 0] = np.log(focals)
-    tied = priors.TiedPriors(np.ones(3), np.full(3, np.nan) if hints is None else hints, families=np.array(families))
+    tied = priors.TiedPriors(
+        np.ones(3), np.full((2, 3, 5), np.nan) if claims is None else claims, families=np.array(families)
+    )
     free = np.zeros((3, 4), np.bool_)
     free[:, 3] = free_focal
     return tied.prior(free, thetas)
@@ -181,10 +190,10 @@ def test_families_are_apart_and_a_single_member_keeps_the_usual_focal():
 
 
 def test_a_claim_comes_before_the_family():
-    found = prior([0, 0, 0], hints=np.array([3.0, np.nan, np.nan]))
+    found = prior([0, 0, 0], claims=claimed(3.0, count=3))
     assert found.mean[0, 0] == pytest.approx(np.log(3))
     assert found.precision[0, 0] > 10 * found.precision[1, 0]
-    freed = prior([0, 0, 0], free_focal=True, hints=np.array([3.0, np.nan, np.nan]))
+    freed = prior([0, 0, 0], free_focal=True, claims=claimed(3.0, count=3))
     assert freed.mean[0, 0] == freed.mean[1, 0]
 
 

@@ -99,7 +99,7 @@ def test_exif_focal_is_read_as_a_hint_in_pixels(folder, run):
     exif.get_ifd(0x8769)[0xA405] = 27
     Image.fromarray(PIXELS).save(folder / "e.jpg", exif=exif)
     photo = next(photo for photo in make(folder, run).photos if photo.name == "e.jpg")
-    assert photo.exif_focal_px == pytest.approx(27 / 36 * 128)
+    assert photo.prior.focal_px == pytest.approx(27 / 36 * 128)
 
 
 def with_gps(folder, **entries):
