@@ -21,7 +21,7 @@ from sfm_app.types import Intrinsics, MatchGraph, Model, PhotoSet, Scene, Surfac
 PHOTOS: Stage[PhotoSet] = Stage(
     name="photos",
     takes=(),
-    settings=("photos", "calibration.deviation", "max_memory_gb", GIVEN_CAMERAS),
+    settings=("photos", "max_memory_gb", GIVEN_CAMERAS),
     files=("photos.json", "photos", "frames", "masks"),
     make=lambda given, run: photos.make(given.source, run),
     load=lambda given, run: photos.load(given.source, run),

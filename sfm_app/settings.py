@@ -51,11 +51,6 @@ class PhotoSettings(Section):
         description="auto: same size and same EXIF camera share one; single: all share one; folder: those of a folder; "
         "each: none share",
     )
-    camera_priors: str = Field(
-        "auto",
-        description="name of the method that estimates the camera of each photo from its content (see `sfm-app "
-        "plugins`): evidence that pairs weigh; auto: an installed one; none: only EXIF",
-    )
     max_frames: int = Field(100, ge=2, le=2000, description="most frames of a video that are used")
     keep_low_quality: bool = Field(False, description="use copies, blurred photos and screenshots, too")
     max_megapixels: float = Field(64.0, ge=0.1, le=178, description="larger photos are scaled down to this size")
@@ -124,6 +119,11 @@ class CalibrationSettings(Section):
     )
     keep: bool = Field(
         False, description="keep the cameras of the calibration file as they are, instead of refining them"
+    )
+    priors: str = Field(
+        "auto",
+        description="name of the method that estimates the camera of each photo from its content (see `sfm-app "
+        "plugins`): evidence that pairs weigh; auto: an installed one; none: only EXIF",
     )
     deviation: float = Field(
         0.0,

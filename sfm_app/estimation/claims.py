@@ -4,7 +4,7 @@ They are priors that the photos weigh; here they are collected, and those that t
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,8 +28,6 @@ from sfm_app.types import (
     Intrinsics,
     MatchedImage,
     MatchGraph,
-    Photo,
-    PhotoSet,
     Scene,
 )
 from sfm_app.types.camera import EQUIRECTANGULAR, PERSPECTIVE
@@ -95,44 +93,46 @@ def claim(images: Iterable[MatchedImage], found: Calibration) -> Claim | None:
     return None if joined is None else Claim(joined, len(priors), found)
 
 
-def with_priors(photos: PhotoSet, run: RunContext) -> PhotoSet:
-    """Return laid-out photos with the claim of a calibration file, else of a plug-in, else of EXIF about each.
+def find_priors(matches: MatchGraph, run: RunContext) -> dict[str, CameraPrior]:
+    """Return the claims of a calibration file, else of a plug-in, by name of the photo.
 
     Raises:
         InputError: the calibration file fits no photo.
         PluginError: the plug-in fails, or its claim is no camera.
     """
-    method = run.plugins.camera_prior_method(run.settings.photos.camera_priors)
-    of_file, named = _priors_of_file(photos.groups, run), photos.photos
+    of_file = _priors_of_file(matches, run)
+    priors = {one.name: of_file[one.group] for one in matches.images.values() if one.group in of_file}
+    method = run.plugins.camera_prior_method(run.settings.calibration.priors)
     if method is not None:
-        unknown = [one for one in named if one.group not in of_file and one.projection != EQUIRECTANGULAR]
-        found = run.map(lambda photo: _find_prior(method, photo, run), unknown, "cameras from single photos")
-        by_name = dict(zip([one.name for one in unknown], found, strict=True))
-        run.record(camera_priors={"method": method.name, "photos": sum(one is not None for one in found)})
-        named = tuple(replace(one, prior=by_name.get(one.name) or one.prior) for one in named)
-    return replace(photos, photos=tuple(replace(one, prior=of_file.get(one.group, one.prior)) for one in named))
+        others = [one for one in matches.images.values() if one.name not in priors]
+        unknown = [one for one in others if one.projection != EQUIRECTANGULAR]
+        found = run.map(lambda image: _find_prior(method, image, run), unknown, "cameras from single photos")
+        known = {one.name: prior for one, prior in zip(unknown, found, strict=True) if prior is not None}
+        run.record(camera_priors={"method": method.name, "photos": len(known)})
+        priors |= known
+    return priors
 
 
-def _find_prior(method: CameraPriorMethod, photo: Photo, run: RunContext) -> CameraPrior | None:
-    pixels = read_pixels(run.workspace.photos / photo.name)
-    turns = photo.turn_deg // 90
+def _find_prior(method: CameraPriorMethod, image: MatchedImage, run: RunContext) -> CameraPrior | None:
+    pixels = read_pixels(run.workspace.photos / image.name)
+    turns = image.turn_deg // 90
     try:
         prior = method.find(np.ascontiguousarray(np.rot90(pixels, -turns)))
     except Exception as err:  # a plug-in may raise anything
-        text = f"the camera priors '{method.name}' failed on {photo.path}: {type(err).__name__}: {err}"
-        raise PluginError(text, hint="choose others with --set photos.camera_priors=NAME, or none") from err
+        text = f"the camera priors '{method.name}' failed on {image.name}: {type(err).__name__}: {err}"
+        raise PluginError(text, hint="choose others with --set calibration.priors=NAME, or none") from err
     if prior is None or prior.center_px is None:
         return prior
-    (x, y), width, height = prior.center_px, photo.width, photo.height
+    (x, y), width, height = prior.center_px, image.width, image.height
     for turn in range(turns):  # back to the orientation of the sensor
         x, y = y, (height if (turns - turn) % 2 else width) - x
     return replace(prior, center_px=(x, y))
 
 
-def _priors_of_file(groups: Mapping[str, Sequence[Photo]], run: RunContext) -> dict[str, CameraPrior]:
+def _priors_of_file(matches: MatchGraph, run: RunContext) -> dict[str, CameraPrior]:
     """Return the claims of a calibration file whose focals may be off, by camera group."""
     share = run.settings.calibration.deviation
-    given = assign_cameras(groups, run.given, keep=False).cameras if share else {}
+    given = assign_cameras(matches, run.given, keep=False).cameras if share else {}
     priors = {}
     for group, camera in given.items():
         straight = camera.projection != PERSPECTIVE

@@ -11,7 +11,7 @@ from sfm_app.colmap.model import posed_images
 from sfm_app.errors import InputError
 from sfm_app.numerical import Json
 from sfm_app.runtime.context import RunContext
-from sfm_app.types import Calibration, GivenCameras, Intrinsics, MatchedImage, MatchGraph, Photo
+from sfm_app.types import Calibration, GivenCameras, Intrinsics, MatchedImage, MatchGraph
 from sfm_app.types.camera import EQUIRECTANGULAR, KEPT
 
 # Cameras of a calibration file, for the photos of a run.
@@ -31,12 +31,10 @@ def given_cameras(matches: MatchGraph, run: RunContext) -> AssignedCameras:
     """Return the given cameras of a run; none where they are only claims, see `claims`."""
     options = run.settings.calibration
     given = GivenCameras() if options.deviation else run.given
-    return assign_cameras(matches.groups, given, keep=options.keep)
+    return assign_cameras(matches, given, keep=options.keep)
 
 
-def assign_cameras(
-    groups: Mapping[str, Sequence[Photo | MatchedImage]], given: GivenCameras, *, keep: bool
-) -> AssignedCameras:
+def assign_cameras(matches: MatchGraph, given: GivenCameras, *, keep: bool) -> AssignedCameras:
     """Return the given camera of every camera group that has one.
 
     A group has the camera that the file names for its photos, or by the name of the group; else the only one of the
@@ -46,7 +44,7 @@ def assign_cameras(
     if not given:
         return AssignedCameras()
     cameras, notes, rejections = {}, [], []
-    for group, images in groups.items():
+    for group, images in matches.groups.items():
         if images[0].projection == EQUIRECTANGULAR:
             continue  # nothing about a panorama is unknown
         name, reason = _choose_name(group, images, given)
@@ -63,7 +61,7 @@ def assign_cameras(
     return AssignedCameras(cameras, (*notes, *rejections))
 
 
-def fit_to_photos(camera: Calibration, image: Photo | MatchedImage) -> tuple[Calibration | None, str]:
+def fit_to_photos(camera: Calibration, image: MatchedImage) -> tuple[Calibration | None, str]:
     """Return a camera in pixels of a photo, and a note if it was scaled; None with the reason where it cannot be."""
     size = image.width, image.height
     if camera.projection == EQUIRECTANGULAR:
@@ -100,7 +98,7 @@ def _scale(
     return replace(camera, K=K, width=size[0], height=size[1], spread=spread), note
 
 
-def _choose_name(group: str, images: Sequence[Photo | MatchedImage], given: GivenCameras) -> tuple[str | None, str]:
+def _choose_name(group: str, images: Sequence[MatchedImage], given: GivenCameras) -> tuple[str | None, str]:
     """Return the name of a group's camera in the file; None with the reason where it has none."""
     named = {given.camera_name(image.name) for image in images} - {None}
     if len(named) == 1:

@@ -299,8 +299,10 @@ def write_inputs(path: Path, inputs: PartInputs) -> None:
     part, evidence = inputs.part, inputs.part.evidence
     known = {
         "photos": list(part.photos),
-        # frames and times of photos do not matter to mapping
-        "images": [asdict(replace(image, gps=None, shown=None)) for image in evidence.matches.images.values()],
+        # frames, times and claims of photos do not matter to mapping
+        "images": [
+            asdict(replace(image, gps=None, shown=None, prior=None)) for image in evidence.matches.images.values()
+        ],
         "intrinsics": evidence.intrinsics.to_dict(),
         "settings": inputs.settings.model_dump(mode="json"),
         "asked": inputs.stop_at_false_joins,

@@ -1,8 +1,10 @@
 """intrinsics: ViewGraph -> Intrinsics."""
 
 from collections import Counter
+from dataclasses import replace
 
 from sfm_app.estimation.calibrating import find_or_keep_intrinsics
+from sfm_app.estimation.claims import find_priors
 from sfm_app.products import write_intrinsics
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, ViewGraph
@@ -10,7 +12,8 @@ from sfm_app.types import Calibration, Intrinsics, MatchGraph, ViewGraph
 
 def make(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
     """Find the cameras, write them to calibration.json and record their figures."""
-    intrinsics = find_or_keep_intrinsics(matches, views, run)
+    priors = find_priors(matches, run)
+    intrinsics = replace(find_or_keep_intrinsics(matches.with_priors(priors), views, run), priors=priors)
     photos = Counter(intrinsics.camera_of.values())
     run.record(
         cameras={name: _summary(camera) for name, camera in intrinsics.cameras.items()},

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from sfm_app.errors import InputError
-from sfm_app.estimation.claims import with_priors
 from sfm_app.files import digest_files, replace_atomically
 from sfm_app.operating_system import is_link
 from sfm_app.photos.decode import UnreadableError
@@ -189,7 +188,6 @@ def _read_photos(
         run.map(lay_out, photo_set.photos, "laying masks out")
         unused = unused_masks(list(source.masks), photo_set.photos)
         run.record(masks={"photos": sum(bool(photo.mask) for photo in photo_set.photos), "unused": unused})
-    photo_set = with_priors(photo_set, run)
     copies = {photo.name: _copy_digest(photo, run) for photo in photo_set.photos}
     write_photo_list(photo_set, copies, run.workspace)
     run.record(usable=len(photos), cameras=len(photo_set.groups), unusable={p.name: p.reason for p in unusable})

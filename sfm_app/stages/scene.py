@@ -33,7 +33,7 @@ def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: Run
     If an earlier model covers most photos, the new ones are registered in it. Raise a ReconstructionError if no pair
     of photos grows into a model.
     """
-    inner, evidence = mapping_run(run), Evidence(matches, views, intrinsics)
+    inner, evidence = mapping_run(run), Evidence(matches.with_priors(intrinsics.priors), views, intrinsics)
     outcome = reconstruct(evidence, inner) if run.earlier is None else map_new_photos(evidence, inner, run.earlier)
     try:
         scene = _finish_scene(outcome, run)

@@ -9,7 +9,14 @@ from sfm_app.products import read_view_graph, write_view_graph
 from sfm_app.runtime.context import GIVEN_CAMERAS, RunContext
 from sfm_app.types import MatchGraph, ViewGraph
 
-LENS_SETTINGS = ("calibration.lens", "calibration.keep", "scene.camera_model", "photos.cameras", GIVEN_CAMERAS)
+LENS_SETTINGS = (
+    "calibration.lens",
+    "calibration.keep",
+    "calibration.deviation",
+    "scene.camera_model",
+    "photos.cameras",
+    GIVEN_CAMERAS,
+)
 """Settings that decide which camera groups have a wide lens."""
 
 

@@ -1,7 +1,7 @@
 """Calibrations: camera matrix, lens, standard deviations and correlations."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from itertools import combinations
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.numerical import finite_entries
-from sfm_app.types.photos import MatchedImage, PairId, Photo
+from sfm_app.types.photos import CameraPrior, MatchedImage, PairId, Photo
 
 PERSPECTIVE, FISHEYE, EQUIRECTANGULAR = "perspective", "fisheye", "equirectangular"
 PROJECTIONS = (PERSPECTIVE, FISHEYE, EQUIRECTANGULAR)
@@ -124,6 +124,8 @@ class Intrinsics:
     """Name of the camera by photo: its camera group, unless that was split because it held several cameras."""
     photos: Mapping[int, str] = field(default_factory=dict)
     """Name of the photo by the id that pairs use."""
+    priors: Mapping[str, CameraPrior] = field(default_factory=dict)
+    """Claims of a calibration file or a plug-in, by name of the photo; those of EXIF belong to the photos."""
 
     def camera_name(self, photo: Photo | MatchedImage) -> str:
         """Return the name of the camera that took a photo."""
@@ -152,13 +154,16 @@ class Intrinsics:
         """Return JSON values."""
         cameras = {name: camera.to_dict() for name, camera in self.cameras.items()}
         photos = {str(key): name for key, name in self.photos.items()}
-        return {"cameras": cameras, "camera_of": dict(self.camera_of), "photos": photos}
+        priors = {"priors": {name: asdict(prior) for name, prior in self.priors.items()}} if self.priors else {}
+        return {"cameras": cameras, "camera_of": dict(self.camera_of), "photos": photos} | priors
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Intrinsics":
         """Rebuild from `to_dict`."""
         cameras = {name: Calibration.from_dict(camera) for name, camera in values["cameras"].items()}
-        return cls(cameras, dict(values["camera_of"]), {int(key): name for key, name in values["photos"].items()})
+        photos = {int(key): name for key, name in values["photos"].items()}
+        priors = {name: CameraPrior.from_dict(prior) for name, prior in values.get("priors", {}).items()}
+        return cls(cameras, dict(values["camera_of"]), photos, priors)
 
 
 def correlation_key(first: str, second: str) -> str:

@@ -44,6 +44,11 @@ class CameraPrior:
         if not (np.isfinite(values).all() and self.focal_px > 0.0 and min(deviations) > 0.0):
             raise ValueError("claims must be finite, and the focal length and every deviation > 0")
 
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "CameraPrior":
+        """Rebuild from `asdict`, also by way of JSON."""
+        return cls(**{**values, "center_px": values["center_px"] and tuple(values["center_px"])})
+
     def move(self, left: float, top: float) -> "CameraPrior":
         """Return the claim in pixels that count from another origin."""
         center = self.center_px and (self.center_px[0] - left, self.center_px[1] - top)
@@ -132,10 +137,9 @@ class Photo:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Photo":
         """Return the photo from the values of `to_dict`; entries of other names are left out."""
-        gps, shown, prior = values.get("gps"), values.get("shown"), values.get("prior")
+        gps, shown = values.get("gps"), values.get("shown")
         known: dict[str, Any] = {"gps": GpsPosition(**gps) if gps else None, "shown": tuple(shown) if shown else None}
-        if prior:
-            known["prior"] = CameraPrior(**{**prior, "center_px": prior["center_px"] and tuple(prior["center_px"])})
+        known["prior"] = CameraPrior.from_dict(values["prior"]) if values.get("prior") else None
         same = {one.name: values[one.name] for one in fields(cls) if one.name in values}
         return cls(**{**same, **known, "notes": tuple(values.get("notes", ()))})
 
@@ -227,6 +231,13 @@ class MatchGraph:
         for _, image in sorted(self.images.items()):
             groups.setdefault(image.group, []).append(image)
         return groups
+
+    def with_priors(self, priors: Mapping[str, CameraPrior]) -> "MatchGraph":
+        """Return the graph with claims about some cameras, by name of the photo, in place of EXIF's."""
+        if not priors:
+            return self
+        images = {key: replace(one, prior=priors.get(one.name, one.prior)) for key, one in self.images.items()}
+        return replace(self, images=images)
 
     def names(self, photos: Iterable[int]) -> list[str]:
         """Return the names of photos."""

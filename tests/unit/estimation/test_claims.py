@@ -1,5 +1,6 @@
 """Claims of EXIF, plug-ins and files about cameras, and those that the photos contradict."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ from PIL import Image
 
 from sfm_app.camera.models import camera_matrix
 from sfm_app.errors import ConfigError, PluginError
-from sfm_app.estimation.claims import Claim, claim, refined_claims, report_claims, with_priors
+from sfm_app.estimation.claims import Claim, claim, find_priors, refined_claims, report_claims
 from sfm_app.plugins import CameraPriorMethod, hookimpl, load_plugins
 from sfm_app.progress import Progress
 from sfm_app.runtime.context import RunContext
@@ -23,8 +24,6 @@ from sfm_app.types import (
     Intrinsics,
     MatchedImage,
     MatchGraph,
-    Photo,
-    PhotoSet,
     Scene,
 )
 
@@ -125,20 +124,19 @@ def network(find):
 
 @pytest.fixture
 def laid_out(tmp_path):
-    """Returns a run with plug-ins and settings, and two photos, of which the second is on its side."""
+    """Returns two photos, of which the second is on its side, and a run with plug-ins and settings."""
     place = Workspace(tmp_path / "out")
     place.create()
+    place.photos.mkdir(exist_ok=True)
     picture = np.zeros((60, 80, 3), np.uint8)
     picture[10, 70] = 255
-    photos = tuple(
-        Photo(f"{name}.png", 80, 60, name, prior=exif(77.0), turn_deg=turn) for name, turn in (("a", 0), ("b", 90))
-    )
-    for photo in photos:
-        place.photos.mkdir(exist_ok=True)
-        Image.fromarray(picture).save(place.photos / photo.name)
+    images = {}
+    for key, (name, turn) in enumerate((("a.png", 0), ("b.png", 90)), start=1):
+        images[key] = MatchedImage(key, name, "one", 80, 60, exif(77.0), turn_deg=turn)
+        Image.fromarray(picture).save(place.photos / name)
     with make_executor(1) as executor:
         yield lambda plugins, **settings: (
-            PhotoSet(tmp_path, photos), RunContext(Settings(**settings), place, plugins, executor, 1)
+            MatchGraph(images, {}, {}), RunContext(Settings(**settings), place, plugins, executor, 1)
         )  # fmt: skip
 
 
@@ -150,39 +148,40 @@ def bright_center(picture):
 
 def test_a_plug_in_sees_upright_photos_and_comes_before_exif(laid_out):
     sizes = []
-    found = with_priors(*laid_out(network(lambda picture: sizes.append(picture.shape) or bright_center(picture))))
+    matches, run = laid_out(network(lambda picture: sizes.append(picture.shape) or bright_center(picture)))
+    found = find_priors(matches, run)
     assert sorted(sizes) == [(60, 80, 3), (80, 60, 3)]
-    assert [one.prior.center_px for one in found.photos] == [(70.5, 10.5)] * 2
-    assert [one.prior.focal_px for one in found.photos] == [120.0] * 2
+    assert found.keys() == {"a.png", "b.png"}
+    assert {one.prior.focal_px for one in matches.with_priors(found).images.values()} == {120.0}
 
 
 @pytest.mark.parametrize("turn", [0, 90, 180, 270])
 def test_a_center_returns_to_the_orientation_of_the_sensor(laid_out, turn):
-    photos, run = laid_out(network(bright_center))
-    photos = replace(photos, photos=tuple(replace(one, turn_deg=turn) for one in photos.photos))
-    assert {one.prior.center_px for one in with_priors(photos, run).photos} == {(70.5, 10.5)}
+    matches, run = laid_out(network(bright_center))
+    turned = replace(matches, images={key: replace(one, turn_deg=turn) for key, one in matches.images.items()})
+    assert {one.center_px for one in find_priors(turned, run).values()} == {(70.5, 10.5)}
 
 
 def test_without_an_answer_or_a_method_exif_remains(laid_out):
-    for plugins, settings in (
-        (network(lambda _: None), {}),
-        (network(bright_center), {"photos": {"camera_priors": "none"}}),
-    ):
-        assert [one.prior.focal_px for one in with_priors(*laid_out(plugins, **settings)).photos] == [77.0] * 2
+    for plugins, name in ((network(lambda _: None), "auto"), (network(bright_center), "none")):
+        matches, run = laid_out(plugins, calibration={"priors": name})
+        assert find_priors(matches, run) == {}
+        assert {one.prior.focal_px for one in matches.with_priors({}).images.values()} == {77.0}
     with pytest.raises(ConfigError, match="another-net"):
-        with_priors(*laid_out(network(bright_center), photos={"camera_priors": "another-net"}))
+        find_priors(*laid_out(network(bright_center), calibration={"priors": "another-net"}))
 
 
 def test_a_failing_plug_in_is_named_with_the_photo(laid_out):
     with pytest.raises(PluginError, match=r"'a-net' failed on a.png: ValueError: .* finite"):
-        with_priors(*laid_out(network(lambda _: CameraPrior("a net", np.nan, 1.0))))
+        find_priors(*laid_out(network(lambda _: CameraPrior("a net", np.nan, 1.0))))
 
 
 def test_a_file_that_may_be_off_is_a_claim_before_all_others(laid_out):
-    photos, run = laid_out(network(bright_center), calibration={"deviation": 0.05})
+    matches, run = laid_out(network(bright_center), calibration={"deviation": 0.05})
     given = replace(camera(150.0, center=(41.0, 29.0), distortion=(-0.1,)), width=80, height=60, method="given")
-    run = replace(run, given=GivenCameras({"one": given}, {}, "a file", "x"))
-    for one in with_priors(photos, run).photos:
-        assert (one.prior.focal_px, one.prior.focal_deviation_px) == (150.0, pytest.approx(7.5))
-        assert (one.prior.center_px, one.prior.k1) == ((41.0, 29.0), -0.1)
-        assert Photo.from_dict(one.to_dict()) == one
+    found = find_priors(matches, replace(run, given=GivenCameras({"one": given}, {}, "a file", "x")))
+    for one in found.values():
+        assert (one.focal_px, one.focal_deviation_px) == (150.0, pytest.approx(7.5))
+        assert (one.center_px, one.k1) == ((41.0, 29.0), -0.1)
+    intrinsics = Intrinsics({}, priors=found)
+    assert Intrinsics.from_dict(json.loads(json.dumps(intrinsics.to_dict()))).priors == found

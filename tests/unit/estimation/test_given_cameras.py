@@ -22,7 +22,7 @@ def photo(key=1, group="a", size=(1000, 800), **values):
 
 def assigned(images, cameras, camera_of=None, *, keep=False):
     graph = MatchGraph({image.id: image for image in images}, {}, {})
-    return assign_cameras(graph.groups, GivenCameras(cameras, camera_of or {}, "cameras.txt (COLMAP)", "x"), keep=keep)
+    return assign_cameras(graph, GivenCameras(cameras, camera_of or {}, "cameras.txt (COLMAP)", "x"), keep=keep)
 
 
 def test_a_single_camera_is_that_of_all_photos_of_its_shape():

@@ -160,7 +160,7 @@ def test_what_mapping_found_stays_when_it_is_interrupted(run, monkeypatch):
     monkeypatch.setattr(scene, "reconstruct", reconstruct)
 
     with pytest.raises(KeyboardInterrupt):
-        scene.make(None, None, None, run)
+        scene.make(MatchGraph({}, {}, {}), None, Intrinsics({}), run)
 
     assert (run.workspace.root / MAPPING / "found").exists()
     assert (scene.mapping_run(run).workspace.root / "found").exists()

@@ -1,0 +1,1 @@
+"""What priors on cameras gain, and what wrong ones cost."""
