@@ -3,6 +3,7 @@
 They are priors that the photos weigh; here they are collected, and those that the photos contradict are named.
 """
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_app.bundle.lens_parts import CameraRule
-from sfm_app.camera.models import CENTER, LENS, NARROW, calibration_from_model
+from sfm_app.camera.models import calibration_from_model
 from sfm_app.colmap.backend import Reconstruction
 from sfm_app.colmap.model import posed_images
 from sfm_app.errors import PluginError
@@ -21,15 +22,7 @@ from sfm_app.numerical import Json
 from sfm_app.plugins import CameraPriorMethod
 from sfm_app.runtime.context import RunContext
 from sfm_app.selfcal.pairs import claimed_calibration
-from sfm_app.types import (
-    Calibration,
-    CameraModel,
-    CameraPrior,
-    Intrinsics,
-    MatchedImage,
-    MatchGraph,
-    Scene,
-)
+from sfm_app.types import Calibration, CameraModel, CameraPrior, Intrinsics, MatchedImage, MatchGraph, Scene
 from sfm_app.types.camera import EQUIRECTANGULAR, PERSPECTIVE
 from sfm_app.types.photos import EXIF, join_priors
 
@@ -130,17 +123,21 @@ def _find_prior(method: CameraPriorMethod, image: MatchedImage, run: RunContext)
 
 
 def _priors_of_file(matches: MatchGraph, run: RunContext) -> dict[str, CameraPrior]:
-    """Return the claims of a calibration file whose focals may be off, by camera group."""
-    share = run.settings.calibration.deviation
-    given = assign_cameras(matches, run.given, keep=False).cameras if share else {}
-    priors = {}
-    for group, camera in given.items():
-        straight = camera.projection != PERSPECTIVE
-        priors[group] = CameraPrior(
-            "the calibration file", camera.focal_px, share * camera.focal_px,
-            (float(camera.K[0, 2]), float(camera.K[1, 2])), NARROW[CENTER] * max(camera.width, camera.height),
-            None if straight else camera.radial, NARROW[LENS],
-        )  # fmt: skip
+    """Return the claims of a calibration file whose focals may be off, by camera group.
+
+    It claims center and lens only where it states their deviations.
+    """
+    share, priors = run.settings.calibration.deviation, {}
+    for group, camera in assign_cameras(matches, run.given, keep=False).cameras.items() if share else ():
+        known, (cx, cy) = camera.spread, camera.K[:2, 2].tolist()
+        prior = CameraPrior(
+            "the calibration file", camera.focal_px, math.hypot(share * camera.focal_px, known.get("fx", 0.0))
+        )
+        if known.keys() >= {"cx", "cy"}:
+            prior = replace(prior, center_px=(cx, cy), center_deviation_px=max(known["cx"], known["cy"]))
+        if "k1" in known and camera.projection == PERSPECTIVE:
+            prior = replace(prior, k1=camera.radial, k1_deviation=known["k1"])
+        priors[group] = prior
     return priors
 
 
@@ -172,12 +169,26 @@ def camera_rules(
         camera = intrinsics.cameras.get(names[image.name])
         if (prior := photo_prior(by_name[image.name])) is not None:
             priors[image.camera_id].append(prior)
+        joined = join_priors(priors[image.camera_id])
         rules[image.camera_id] = CameraRule(
             given=camera if camera is not None and camera.is_given else None,
-            prior=join_priors(priors[image.camera_id]),
+            prior=joined and _agreeing_parts(joined, camera),
             model="" if camera_model == "auto" else camera_model,
         )
     return {camera_id: rule for camera_id, rule in rules.items() if rule.given or rule.prior or rule.model}
+
+
+def _agreeing_parts(prior: CameraPrior, camera: Calibration | None) -> CameraPrior:
+    """Return a claim without a center or a lens that the pairs have contradicted; the focal may still prove right."""
+    if camera is None:
+        return prior
+    if prior.center_px is not None:
+        off = np.abs(camera.K[:2, 2] - prior.center_px).max()
+        if off > CHECKS.sigmas * prior.center_deviation_px:
+            prior = replace(prior, center_px=None)
+    if prior.k1 is not None and abs(camera.radial - prior.k1) > CHECKS.sigmas * prior.k1_deviation:
+        prior = replace(prior, k1=None)
+    return prior
 
 
 def refined_claims(scene: Scene, intrinsics: Intrinsics, matches: MatchGraph) -> dict[str, Claim | None]:

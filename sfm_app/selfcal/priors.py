@@ -3,9 +3,9 @@
 Ours; the choice by marginal likelihood is that of `geometry.least_squares`. Most photos are uncropped, their pixels
 square, their lens nearly straight; some are not. So center, aspect and lens each have two priors: a narrow one about
 the usual value, and a wide one. A parameter is freed only where the evidence for the wide prior outweighs how rare such
-photos are; otherwise it stays near its usual value. A claim about a camera is the narrow prior in place of the usual
-one, and loses against pairs that contradict it. Where photos of one folder have a camera each, a hierarchical prior
-ties their focals.
+photos are; otherwise it stays near its usual value. A claim about a camera has a narrow prior in place of the usual
+one, until freeing its focal rejects all of it. Where photos of one folder have a camera each, a hierarchical prior ties
+their focals.
 """
 
 from collections.abc import Sequence
@@ -97,7 +97,7 @@ class CameraPriors:
         narrow = across * [PRIORS.focal_spread, center, center, NARROW[ASPECT], k1]
         center, k1 = self.center_sigma, WIDE[LENS] if self.lens else k1
         wide = across * [PRIORS.focal_spread, center, center, WIDE[ASPECT], k1]
-        claimed = np.isfinite(self.claims[0]) & ~freed
+        claimed = np.isfinite(self.claims[0]) & ~freed & ~free[:, [FOCAL]]
         claimed[:, KAPPA] &= self.lens
         mean = np.where(claimed, self.claims[0], usual)
         deviation = np.where(claimed, self.claims[1], np.where(freed, wide, narrow))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_app.camera.models import LENS
+from sfm_app.camera.models import FOCAL, LENS
 from sfm_app.selfcal.adjustment import Matches
 from sfm_app.selfcal.calibrate_pairs import (
     Fit,
@@ -123,6 +123,8 @@ def _calibrate_from_matches(
     sigma = options.center_sigma * pairs.size[0] / side
     priors = CameraPriors(np.ones(1), claim_rows([pairs.prior], [pairs.size], side), sigma, options.lens)
     adjusted = _adjust(pairs, usable, priors)
+    if adjusted.fit.free[0, FOCAL] and pairs.prior is not None:  # rejected: it is no evidence, and may not cost any
+        return _calibrate_from_matches(replace(pairs, prior=None), usable, options, evidence)
     if adjusted.is_contradicted:
         adjusted = max(adjusted, _adjust(pairs, usable, priors, adjusted), key=lambda one: one.vote_share)
     fit, peak, weights = adjusted.fit, adjusted.peak, adjusted.consensus.pairs.weights

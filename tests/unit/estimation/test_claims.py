@@ -176,12 +176,14 @@ def test_a_failing_plug_in_is_named_with_the_photo(laid_out):
         find_priors(*laid_out(network(lambda _: CameraPrior("a net", np.nan, 1.0))))
 
 
-def test_a_file_that_may_be_off_is_a_claim_before_all_others(laid_out):
-    matches, run = laid_out(network(bright_center), calibration={"deviation": 0.05})
+@pytest.mark.parametrize("known", [{}, {"fx": 4.0, "cx": 1.0, "cy": 2.0, "k1": 0.01}])
+def test_a_file_that_may_be_off_claims_what_it_states_deviations_of(laid_out, known):
+    matches, run = laid_out(network(bright_center), calibration={"deviation": 0.02})
     given = replace(camera(150.0, center=(41.0, 29.0), distortion=(-0.1,)), width=80, height=60, method="given")
-    found = find_priors(matches, replace(run, given=GivenCameras({"one": given}, {}, "a file", "x")))
+    given = GivenCameras({"one": replace(given, spread=known)}, {}, "a file", "x")
+    found = find_priors(matches, replace(run, given=given))
     for one in found.values():
-        assert (one.focal_px, one.focal_deviation_px) == (150.0, pytest.approx(7.5))
-        assert (one.center_px, one.k1) == ((41.0, 29.0), -0.1)
+        assert (one.focal_px, one.focal_deviation_px) == (150.0, pytest.approx(5.0 if known else 3.0))
+        assert (one.center_px, one.k1) == (((41.0, 29.0), -0.1) if known else (None, None))
     intrinsics = Intrinsics({}, priors=found)
     assert Intrinsics.from_dict(json.loads(json.dumps(intrinsics.to_dict()))).priors == found
