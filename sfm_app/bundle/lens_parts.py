@@ -172,59 +172,51 @@ class LensPriors:
 
     @classmethod
     def from_cameras(
-        cls, params: FloatArray, family: IndexArray, sizes: FloatArray, estimated: BoolArray
-    ) -> "LensPriors":
-        """Return the priors of cameras (C, 12), as in `Bundle`, before any evidence."""
+        cls, params: FloatArray, family: IndexArray, sizes: FloatArray, estimated: BoolArray,
+        rules: Sequence["CameraRule"] = (),
+    ) -> "LensPriors":  # fmt: skip
+        """Return the priors of cameras (C, 12), as in `Bundle`, before any evidence; `rules` are one for each, or none.
+
+        `estimated` (C, 8) are the parts to estimate where no rule decides.
+        """
         reach = np.hypot(*sizes.T) / (2.0 * np.sqrt(params[:, FX] * params[:, FY]))
         reach = np.where(family == FISHEYE, np.minimum(reach, SEEN_ANGLE), reach)
+        rules = rules or (NO_RULE,) * len(params)
+        fixed = np.array([rule.is_kept for rule in rules], np.bool_)
         usual, claims = np.zeros_like(params), np.full_like(params, np.nan)
         usual[:, [FX, FY]], usual[:, [CX, CY]] = 1.0, sizes / 2.0
-        priors = cls(sizes, family, reach, estimated, (), usual, claims, np.zeros(len(params), np.bool_))
-        choices = map(priors.consistent_choices, range(len(params)))
-        return replace(
-            priors, choices=tuple(one[~np.any(one & ~row, axis=1)] for one, row in zip(choices, estimated, strict=True))
-        )
+        priors = cls(sizes, family, reach, estimated.copy(), (), usual, claims, fixed)
+        for row, rule in enumerate(rules):
+            given, claim = rule.usual(int(family[row])), rule.prior
+            if given is not None:
+                usual[row] = given
+            elif claim is not None:
+                usual[row, [FX, FY]], claims[row, LOG_FOCAL] = claim.focal_px, claim.focal_deviation_px / claim.focal_px
+                if claim.center_px is not None:
+                    usual[row, [CX, CY]], claims[row, [CX, CY]] = claim.center_px, claim.center_deviation_px
+                if claim.k1 is not None and family[row] == PERSPECTIVE:
+                    usual[row, K1], claims[row, K1] = claim.k1, claim.k1_deviation
+        choices = [priors.consistent_choices(row) for row in range(len(params))]
+        for row, rule in enumerate(rules):
+            parts, own = rule.parts(int(family[row])), priors.estimated[row]
+            if rule.is_kept:
+                own[:] = False
+            elif parts is not None:
+                choices[row] = choices_of_model(parts, choices[row])
+                own[:] = choices[row].any(axis=0) | _is_focal(int(family[row]))
+            choices[row] = choices[row][~np.any(choices[row] & ~own, axis=1)]
+        return replace(priors, choices=tuple(choices))
 
     def consistent_choices(self, camera: int) -> BoolArray:
         """Return all choices (K, 8) for a camera; a focal that nobody claims is no choice."""
-        choices = consistent_choices(int(self.family[camera]))
-        if np.isfinite(self.claims[camera, LOG_FOCAL]):
-            return choices
-        return choices[~choices[:, _is_focal(int(self.family[camera]))].ravel()]
+        choices, is_focal = consistent_choices(int(self.family[camera])), _is_focal(int(self.family[camera]))
+        claimed = np.isfinite(self.claims[camera, LOG_FOCAL])
+        return choices if claimed else choices[~choices[:, is_focal].ravel()]
 
     @property
     def sides(self) -> FloatArray:
         """(C,) longer sides in pixels."""
         return np.asarray(self.sizes.max(axis=1), np.float64)
-
-    def with_rules(self, rules: Sequence["CameraRule"]) -> "LensPriors":
-        """Return the priors under the user's rules and claims, one of each for every camera."""
-        usual, claims = self.usual.copy(), self.claims.copy()
-        for row, rule in enumerate(rules):
-            given = rule.usual(int(self.family[row]))
-            if given is not None:
-                usual[row] = given
-            elif rule.prior is not None:
-                prior = rule.prior
-                usual[row, [FX, FY]], claims[row, LOG_FOCAL] = prior.focal_px, prior.focal_deviation_px / prior.focal_px
-                if prior.center_px is not None:
-                    usual[row, [CX, CY]], claims[row, [CX, CY]] = prior.center_px, prior.center_deviation_px
-                if prior.k1 is not None and self.family[row] == PERSPECTIVE:
-                    usual[row, K1], claims[row, K1] = prior.k1, prior.k1_deviation
-        claimed = replace(self, usual=usual, claims=claims)
-        estimated, choices = self.estimated.copy(), list[BoolArray]()
-        for row, rule in enumerate(rules):
-            parts, allowed = rule.parts(int(self.family[row])), claimed.consistent_choices(row)
-            if rule.is_kept:
-                estimated[row], allowed = False, allowed[:1]
-            elif parts is not None:
-                allowed = choices_of_model(parts, allowed)
-                estimated[row] = allowed.any(axis=0) | _is_focal(int(self.family[row]))
-            else:
-                allowed = allowed[~np.any(allowed & ~estimated[row], axis=1)]
-            choices.append(allowed)
-        fixed = np.array([rule.is_kept for rule in rules], np.bool_)
-        return replace(claimed, estimated=estimated, choices=tuple(choices), fixed=fixed)
 
     def drop_lens(self, camera: int, free: BoolArray) -> "LensPriors":
         """Return the priors without the choices for a camera that have the radial terms of a barred one (8,)."""

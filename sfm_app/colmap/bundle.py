@@ -251,8 +251,8 @@ def lens_priors(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle, 
     many = np.array([used[camera_id] >= OPTIONS.min_photos for camera_id in ids])
     always = [[part.name in ("focal", "k1") for part in PARTS[int(kind)]] for kind in bundle.family]
     estimated = (many[:, None] | np.array(always).reshape(-1, COUNT)) & (bundle.family != PANORAMA)[:, None]
-    priors = LensPriors.from_cameras(bundle.params, bundle.family, sizes, estimated)
-    return priors.with_rules([rules.get(camera_id, NO_RULE) for camera_id in ids]) if rules else priors
+    of_cameras = [rules.get(camera_id, NO_RULE) for camera_id in ids]
+    return LensPriors.from_cameras(bundle.params, bundle.family, sizes, estimated, of_cameras)
 
 
 # The camera model that the photos support: other families of a lens, and the ranking of all models.

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from sfm_app.bundle.lens_evidence import estimate_lenses
-from sfm_app.bundle.lens_parts import PERSPECTIVE_PARTS, LensPriors
+from sfm_app.bundle.lens_parts import PERSPECTIVE_PARTS, CameraRule, LensPriors
 from sfm_app.bundle.normal_equations import Bundle, bundle_scale, project, reduce
 from sfm_app.camera.rows import CAMERA, PERSPECTIVE
+from sfm_app.types import CameraPrior
 
 SIZE = np.array([1000.0, 800.0])
 PLAIN = (900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0)
@@ -50,16 +51,17 @@ def starting_at(bundle, *params):
     return replace(bundle, params=padded(*params))
 
 
-def asked(bundle, *cameras):
+def asked(bundle, *cameras, rules=()):
     """All about some cameras, of others only focal and k1."""
     always = np.array([name in ("focal", "k1") for name in NAMES])
     rows = np.array([always | bool(all_of) for all_of in cameras])
-    return LensPriors.from_cameras(bundle.params, bundle.family, np.tile(SIZE, (len(rows), 1)), rows)
+    return LensPriors.from_cameras(bundle.params, bundle.family, np.tile(SIZE, (len(rows), 1)), rows, rules)
 
 
-def answer(bundle, *cameras):
+def answer(bundle, *cameras, claim=None):
     cameras = cameras or (True,) * len(bundle.params)
-    return estimate_lenses(bundle.params, reduce(bundle, bundle_scale(bundle)), asked(bundle, *cameras))
+    rules = [CameraRule(prior=claim)] * len(cameras)
+    return estimate_lenses(bundle.params, reduce(bundle, bundle_scale(bundle)), asked(bundle, *cameras, rules=rules))
 
 
 def freed(found, camera=0):
@@ -167,3 +169,22 @@ def test_a_bundle_that_says_nothing_leaves_cameras_as_unsure_as_they_were_before
     found = answer(bundle)
     assert found.params[0, :8] == pytest.approx(PLAIN, abs=1)
     assert 0.5 * 900 < found.deviations[0, 0] < 1.5 * 900 and not found.determined.any()
+
+
+@pytest.mark.parametrize(("factor", "contradicted"), [(1.0, False), (1.03, False), (0.8, True), (1.2, True)])
+def test_photos_outweigh_a_claimed_focal(factor, contradicted):
+    bundle = seen(list(PLAIN))
+    plain, found = answer(bundle), answer(bundle, claim=CameraPrior("a net", 900.0 * factor, 45.0 * factor))
+    assert freed(plain) == set() and freed(found) == ({"focal"} if contradicted else set())
+    assert abs(found.params[0, 0] - plain.params[0, 0]) < 0.2 * plain.deviations[0, 0]
+    assert found.deviations[0, 0] == pytest.approx(plain.deviations[0, 0], rel=0.1)
+
+
+def test_a_claim_determines_what_the_photos_leave_open():
+    true = [30000.0, 30000.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]
+    bundle = starting_at(seen(true, noise_px=1.0, points=100), [27000.0, 27000.0, *true[2:]])
+    claim = CameraPrior("a net", 30300.0, 300.0)
+    plain, found = answer(bundle), answer(bundle, claim=claim)
+    assert plain.deviations[0, 0] > 1500
+    assert found.params[0, :2] == pytest.approx([30300.0] * 2, abs=150)
+    assert 250 < found.deviations[0, 0] < 0.6 * plain.deviations[0, 0]
