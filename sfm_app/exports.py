@@ -4,7 +4,6 @@ Only this module moves poses, points and vertices into that frame. InputError wh
 or photos are missing or damaged, and where a target holds files that no export has written.
 """
 
-import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -30,7 +29,7 @@ from sfm_app.colmap.surface import FUSED, open_points, positions
 from sfm_app.colmap.wide_views import ViewNames, WideLens, render_views, save_picture
 from sfm_app.engine.stage import Products, Stage, check_undamaged, resume_hint
 from sfm_app.errors import InputError
-from sfm_app.files import replace_atomically, replace_folder
+from sfm_app.files import RECORD, recorded_files, replace_atomically, replace_folder
 from sfm_app.formats.scenes import plain_names
 from sfm_app.frame.scale import GPS, MetricFrame, move_model
 from sfm_app.frame.sighted_points import Distance, PosedPhotos, measure_distance
@@ -255,8 +254,6 @@ def view_names(cameras: dict[str, int], lenses: dict[int, WideLens]) -> ViewName
 
 # Target folders: written as a whole or not at all, and never over files that no export has written.
 
-RECORD = "export.json"
-"""In the folder of an export: its format, its files, and the photo of each picture."""
 ELSEWHERE = "name another place with -o"
 
 
@@ -281,18 +278,10 @@ def check_replaceable(target: Path) -> None:
     if not target.exists():
         return
     files = _list_files(target)
-    foreign = sorted(set(files) - {*_recorded_files(target), RECORD})
+    foreign = sorted(set(files) - {*recorded_files(target), RECORD})
     if foreign:
         raise InputError(f"{target} holds files that no export has written, such as {foreign[0]}", hint=ELSEWHERE)
 
 
 def _list_files(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
-
-
-def _recorded_files(folder: Path) -> list[str]:
-    try:
-        known = json.loads((folder / RECORD).read_text(encoding="utf-8"))["files"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return []
-    return [str(name) for name in known] if isinstance(known, list) else []

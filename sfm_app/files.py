@@ -15,6 +15,11 @@ from numpy.typing import NDArray
 
 from sfm_app.operating_system import is_link, move, replace_file
 
+PROGRAM, MANIFEST, LOCK, LOG = "sfm-app", "manifest.json", ".lock", "log.txt"
+RUN_FOLDERS = ("photos", "frames", "masks", "sparse", "other_models", "dense", "surface", "texture")
+"""Folders that a run makes in its output folder."""
+RECORD = "export.json"
+"""In the folder of an export: its format, its files, and the photo of each picture."""
 UNFINISHED = "unfinished.txt"
 """Marker in a folder that a stage is filling: the fingerprint of the inputs."""
 
@@ -46,6 +51,27 @@ def replace_folder(target: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(draft, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)
+
+
+def is_made_by_run(folder: Path) -> bool:
+    """Return whether a folder is the output of a run, also of an unfinished one."""
+    unfinished = (folder / LOCK).is_file() and (folder / LOG).is_file()
+    return unfinished or read_object(folder / MANIFEST).get("program") == PROGRAM
+
+
+def recorded_files(folder: Path) -> list[str]:
+    """Return the files that an export lists in its folder; none where no export has made it."""
+    known = read_object(folder / RECORD).get("files")
+    return [str(name) for name in known] if isinstance(known, list) else []
+
+
+def read_object(file: Path) -> dict[str, Any]:
+    """Return the object of a JSON file; empty if it is missing, unreadable or very large."""
+    try:
+        found = json.loads(file.read_text(encoding="utf-8")) if file.stat().st_size < 64_000_000 else {}
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def resume_or_clear(folder: Path, made_from: str) -> bool:

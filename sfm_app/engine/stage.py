@@ -10,10 +10,10 @@ from typing import Any, Generic, TypeVar, cast
 
 from sfm_app.colmap.backend import versions as colmap_versions
 from sfm_app.errors import DamagedProductError, InputError
-from sfm_app.files import fingerprint
+from sfm_app.files import PROGRAM, fingerprint
 from sfm_app.photos.source import Source
 from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
-from sfm_app.runtime.workspace import PROGRAM, Workspace
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.wording import list_names
 
 Product = TypeVar("Product")

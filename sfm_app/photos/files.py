@@ -1,11 +1,15 @@
 """Files of a folder that may be photos or videos."""
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+
+from PIL import Image
 
 from sfm_app.errors import InputError
+from sfm_app.files import PROGRAM, RUN_FOLDERS, is_made_by_run, recorded_files
 from sfm_app.operating_system import is_link
 
 EXTENSIONS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts", ".3gp")
@@ -52,25 +56,145 @@ def _has_packets(head: bytes, first: int, length: int) -> bool:
 HINT = "name the folder that holds the photos"
 
 
-def list_files(folder: Path, out: Path, listed_in: Path | None = None, closed: Sequence[Path] = ()) -> list[str]:
-    """Return the names of all files below the folder, with forward slashes, sorted.
+SYSTEM_FOLDERS = ("@eadir", "__macosx", "#recycle", "$recycle.bin", "lost+found")
+"""Folders of thumbnails, of copies and of removed files that systems make; those that begin with a dot are hidden."""
+SMALLER = "a smaller copy of another photo"
+DERIVED = {
+    "mask": "a mask; name its folder with --masks",
+    "masks": "a mask; name its folder with --masks",
+    "depth": "a depth map", "depths": "a depth map", "depthmap": "a depth map", "depthmaps": "a depth map",
+    "disparity": "a depth map", "disparities": "a depth map",
+    "normal": "a normal map", "normals": "a normal map",
+    "thumb": SMALLER, "thumbs": SMALLER, "thumbnail": SMALLER, "thumbnails": SMALLER,
+    "preview": SMALLER, "previews": SMALLER,
+    "dense": "an undistorted copy of another photo", "undistorted": "an undistorted copy of another photo",
+}  # fmt: skip
+"""Words in the paths of pictures that programs make of photos. A word alone is no proof; see `_derived_from`."""
+MODELS = (".mtl", ".gltf", ".ply", ".dae", ".usda")
+"""Suffixes of models that name the pictures of their textures."""
+NAMED_BYTES = 1_000_000
+"""Bytes of a model that are searched for names."""
 
-    Hidden folders and links to folders are not entered; each counts as one file. The output folder `out` and the
-    folders `closed` are left out.
+
+def list_photos(folder: Path, out: Path, listed_in: Path | None = None, closed: Sequence[Path] = ()) -> dict[str, str]:
+    """Return the names that `list_files` does, each with the reason why it is no photo; most reasons are empty.
 
     `listed_in` is a text file with the names to return instead, one per line, relative to the folder. An InputError
     says that the folder does not exist or cannot be read.
     """
     if not folder.is_dir():
         raise _bad_path_error(folder)
+    if listed_in is not None:
+        return dict.fromkeys(_read_list(listed_in), "")
+    made = _find_made(folder, {place.resolve() for place in (out, *closed)})
+    names = list_files(folder, out, (*closed, *(folder / name for name in made)))
+    derived = _derived_from(folder, names) | _textures(folder, names)
+    return dict(sorted((made | dict.fromkeys(names, "") | derived).items()))
+
+
+def list_files(folder: Path, out: Path, closed: Sequence[Path] = ()) -> list[str]:
+    """Return the names of all files below the folder, with forward slashes, sorted.
+
+    Hidden folders and links to folders are not entered; each counts as one file. The output folder `out` and the
+    folders `closed` are left out. An InputError says that the folder cannot be read.
+    """
     try:
         next(folder.iterdir(), None)
     except OSError as err:
         raise InputError(f"cannot read {folder}: {err.strerror}") from err
-    if listed_in is not None:
-        return _read_list(listed_in)
     excluded = {place.resolve() for place in (out, *closed)}
     return sorted(path.relative_to(folder).as_posix() for path in _walk(folder, excluded))
+
+
+def _find_made(folder: Path, excluded: set[Path]) -> dict[str, str]:
+    """Return the folders of runs, exports and systems, with reasons; of a folder of a run itself, those it fills."""
+    made: dict[str, str] = {}
+    for place, folders, _ in os.walk(folder):
+        here, within = Path(place), is_made_by_run(Path(place))
+        entered = []
+        for name in folders:
+            path = here / name
+            if name.startswith(".") or is_link(path) or path.resolve() in excluded:
+                continue
+            if is_made_by_run(path) or recorded_files(path) or (within and name in RUN_FOLDERS):
+                made[path.relative_to(folder).as_posix()] = f"a folder that {PROGRAM} made"
+            elif name.casefold() in SYSTEM_FOLDERS:
+                made[path.relative_to(folder).as_posix()] = "a folder of the system, not of photos"
+            else:
+                entered.append(name)
+        folders[:] = entered
+    return made
+
+
+def _derived_from(folder: Path, names: Sequence[str]) -> dict[str, str]:
+    """Return the pictures that programs made of photos beside them, with reasons.
+
+    A word in the path tells them, and so does the name of a photo in their own, or a picture without color. Folders
+    that hold nothing else are photos: thumbnails, say, whose originals are lost.
+    """
+    told = {name: found for name in names if (found := _word(name))}
+    photos: dict[tuple[str, ...], str] = {}
+    for name in names:
+        if name not in told:
+            photos.setdefault(_words(PurePosixPath(name).name), name)
+    derived = {}
+    for name, (reason, stem) in told.items() if photos else ():
+        photo = photos.get(stem)
+        mode, width = _mode_and_width(folder, name)
+        if reason == SMALLER:
+            is_made = photo is not None and 0 < width < _mode_and_width(folder, photo)[1]
+        else:
+            is_made = photo is not None or mode in ("1", "L", "LA", "I", "I;16", "I;16B", "F")
+        if is_made:
+            derived[name] = reason
+    return derived
+
+
+def _word(name: str) -> tuple[str, tuple[str, ...]] | None:
+    """Return what a word in a path claims, and the words of the photo's name; None without such a word."""
+    *parents, words = (_words(part) for part in PurePosixPath(name).parts)
+    for place, word in enumerate(words):
+        if word in DERIVED:
+            return DERIVED[word], words[:place] or words[place + 1 :]
+    for parent in reversed(parents):
+        if len(parent) == 2 and parent[0] in ("image", "images") and parent[1].isdecimal():
+            return SMALLER, words
+        if reason := next((DERIVED[word] for word in parent if word in DERIVED), ""):
+            return reason, words
+    return None
+
+
+def _words(text: str) -> tuple[str, ...]:
+    """Return the words and numbers of a name, without its endings: those of `a_1.JPG.png` are a and 1."""
+    words = re.findall(r"[^\W_]+", re.sub(r"(\.(jpe?g|png|tiff?|webp|bmp|exr|npy))+$", "", text.casefold()))
+    return tuple(words)
+
+
+def _mode_and_width(folder: Path, name: str) -> tuple[str, int]:
+    try:
+        if isinstance(place := resolve_file(folder, name), str):
+            return "", 0
+        with Image.open(place) as image:
+            return image.mode, image.width
+    except Exception:  # decoders of damaged bytes raise all kinds of errors
+        return "", 0
+
+
+def _textures(folder: Path, names: Sequence[str]) -> dict[str, str]:
+    """Return the pictures that a model in their folder names as its texture, with reasons."""
+    textures = {}
+    for model in (name for name in names if PurePosixPath(name).suffix.lower() in MODELS):
+        try:
+            with (folder / model).open("rb") as file:
+                text = file.read(NAMED_BYTES)
+        except OSError:
+            continue
+        parent = PurePosixPath(model).parent
+        for name in names:
+            path = PurePosixPath(name)
+            if path.parent == parent and path.suffix.lower() not in MODELS and os.fsencode(path.name) in text:
+                textures[name] = f"a texture of {model}"
+    return textures
 
 
 def _bad_path_error(path: Path) -> InputError:

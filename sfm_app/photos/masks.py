@@ -31,7 +31,7 @@ def list_masks(masks: Path, photos: Path, out: Path) -> list[str]:
         raise InputError(f"{problem} of masks: {masks}", hint=MASK_HINT)
     if masks.resolve() == photos.resolve():
         raise InputError(f"the masks lie among the photos in {photos}", hint="give the masks a folder of their own")
-    return list_files(masks, out, closed=(photos,))
+    return list_files(masks, out, (photos,))
 
 
 def find_mask(photo: Photo, folder: Path, masks: Path) -> Photo | UnusablePhoto:

@@ -14,7 +14,7 @@ from sfm_app.errors import ConfigError, InputError
 from sfm_app.files import digest_file, fingerprint, is_below
 from sfm_app.operating_system import is_link, link_or_copy
 from sfm_app.photos.decode import UnreadableError, large_photo_lock, read_picture, rotate_to_sensor, upright_image
-from sfm_app.photos.files import is_video, list_files, read_head, resolve_file
+from sfm_app.photos.files import is_video, list_photos, read_head, resolve_file
 from sfm_app.photos.masks import list_masks
 from sfm_app.settings import PhotoSettings
 from sfm_app.types import Photo, PhotoSet
@@ -35,6 +35,8 @@ class Source:
     video: bool
     files: Mapping[str, str]
     """Hashes of the files by name; for a video, one hash under an empty name."""
+    left_out: Mapping[str, str]
+    """Reasons why files are no photos, by name; these are not opened."""
     mask_dir: Path | None
     masks: Mapping[str, str]
     """Hashes of the masks by name."""
@@ -44,7 +46,7 @@ class Source:
     @property
     def fingerprint(self) -> str:
         """Hash of the path, the files and the masks."""
-        return fingerprint(str(self.path.resolve()), self.files, self.masks)
+        return fingerprint(str(self.path.resolve()), self.files, self.left_out, self.masks)
 
     def content_hash(self, photos: PhotoSet) -> str:
         """Return a hash of the used photos and their masks, without camera groups, which do not affect features."""
@@ -81,13 +83,15 @@ def read_source(path: Path, out: Path, options: PhotoSettings, spread: ParallelM
     listed = Path(options.images) if options.images else None
     if video and listed is not None:
         raise ConfigError("--images lists photos of a folder, not frames of a video", hint="leave --images out")
-    names = [""] if video else list_files(path, out, listed, closed=() if mask_dir is None else (mask_dir,))
+    found = {"": ""} if video else list_photos(path, out, listed, closed=() if mask_dir is None else (mask_dir,))
+    names = [name for name, reason in found.items() if not reason]
+    left_out = {name: reason for name, reason in found.items() if reason}
     mask_names = [] if mask_dir is None else list_masks(mask_dir, path, out)
     paths = [path / name for name in names] + [mask_dir / name for name in mask_names if mask_dir is not None]
     stamps = {file: stamp for file in paths if (stamp := _stamp(file)) is not None}
     files = {"": digest(path)} if video else _digests(path, names, spread)
     masks = {} if mask_dir is None else _digests(mask_dir, mask_names, spread)
-    return Source(path, video, files, mask_dir, masks, stamps)
+    return Source(path, video, files, left_out, mask_dir, masks, stamps)
 
 
 def digest(file: Path) -> str:

@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from sfm_app.colmap.model import ModelFigures, model_figures
 from sfm_app.errors import SfmError
-from sfm_app.files import replace_atomically
+from sfm_app.files import LOCK, replace_atomically
 from sfm_app.numerical import Json, json_text
 from sfm_app.report import findings
 from sfm_app.report.contents import UNREADABLE, RunContents, read_contents
@@ -31,7 +31,7 @@ from sfm_app.report.findings import (
 from sfm_app.report.pictures import depth_pictures, page_figures
 from sfm_app.report.scene_view import embedded_view
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.workspace import LOCK, Workspace
+from sfm_app.runtime.workspace import Workspace
 
 logger = logging.getLogger("sfm_app")
 

@@ -16,13 +16,22 @@ from typing import Any
 from filelock import BaseFileLock, FileLock, Timeout
 
 from sfm_app.errors import InputError
-from sfm_app.files import UNFINISHED, fingerprint, replace_atomically
+from sfm_app.files import (
+    LOCK,
+    LOG,
+    MANIFEST,
+    PROGRAM,
+    RUN_FOLDERS,
+    UNFINISHED,
+    fingerprint,
+    read_object,
+    replace_atomically,
+)
 from sfm_app.numerical import json_text
 from sfm_app.operating_system import is_link
 
 # The manifest: the finished stages with their inputs, settings, figures and files.
 
-MANIFEST, PROGRAM = "manifest.json", "sfm-app"
 FORMAT = 2
 """Version of the stages' files; it increases when older programs can no longer read them."""
 CHECKSUM = "check"
@@ -62,13 +71,8 @@ class Manifest:
 
     def read(self) -> dict[str, Any]:
         """Return the manifest; empty if it is missing or unreadable (then all stages run again)."""
-        try:
-            if self.path.stat().st_size > 64_000_000:
-                return {}
-            manifest = json.loads(self.path.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
-            return {}
-        return manifest if isinstance(manifest, dict) and isinstance(manifest.get("stages", {}), dict) else {}
+        manifest = read_object(self.path)
+        return manifest if isinstance(manifest.get("stages", {}), dict) else {}
 
     def check_format(self) -> None:
         """Check that this program can read the files of the run; InputError if another version wrote them."""
@@ -148,11 +152,10 @@ def _size(path: Path) -> int | None:
 
 
 DATABASE, CALIBRATION, SCENE, SCALE = "database.db", "calibration.json", "scene.json", "scale.json"
-FOLDERS = ("photos", "frames", "masks", "sparse", "other_models", "dense", "surface", "texture")
-OUTPUT_NAMES = (*FOLDERS, DATABASE, CALIBRATION, SCENE, SCALE)
+OUTPUT_NAMES = (*RUN_FOLDERS, DATABASE, CALIBRATION, SCENE, SCALE)
 """Files and folders that a run replaces."""
-LOCK, HOLDER = ".lock", ".held-by.txt"
-LOG, PARTS, FEATURES, MAPPING = "log.txt", "view_graph_parts", "feature_parts", ".mapping"
+HOLDER = ".held-by.txt"
+PARTS, FEATURES, MAPPING = "view_graph_parts", "feature_parts", ".mapping"
 EARLIER, CLUSTER_FILES, SIFT_ROWS = ".earlier", ".cluster", ".sift_rows"
 LINK_CHECKED = (*OUTPUT_NAMES, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING, EARLIER, CLUSTER_FILES, SIFT_ROWS)
 """Names that a run writes to: a link there would lead it out of the folder."""

@@ -167,7 +167,8 @@ def _read_photos(
         largest = min(options.max_megapixels, largest_photo_megapixels(run.memory_mb))
         options = options.model_copy(update={"max_megapixels": largest})
     contents = read_all(source, folder, names, options, run)
-    unreadable = [photo for photo in contents if isinstance(photo, UnusablePhoto)]
+    unreadable = [UnusablePhoto(name, reason) for name, reason in source.left_out.items()]
+    unreadable += [photo for photo in contents if isinstance(photo, UnusablePhoto)]
     stats, masked = attach_masks([one for one in contents if isinstance(one, PhotoStats)], folder, source, run)
     photos, useless = select_photos(stats, keep_low_quality=options.keep_low_quality)
     unusable = sorted(unreadable + masked + useless, key=lambda photo: photo.name)

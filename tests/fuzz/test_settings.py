@@ -6,7 +6,7 @@ from click.testing import CliRunner
 from sfm_app.cli.options import parse_assignment
 from sfm_app.cli.program import main
 from sfm_app.errors import ConfigError, InputError
-from sfm_app.photos.files import list_files, resolve_file
+from sfm_app.photos.files import list_photos, resolve_file
 from sfm_app.settings import MOST_TOML_BYTES, Settings
 
 from .mutations import ANYTHING, damaged, text_values
@@ -76,10 +76,10 @@ def test_strange_names_in_a_list_are_left_out(tmp_path, line):
     folder.mkdir()
     (tmp_path / "secret.jpg").write_bytes(b"secret")
     (tmp_path / "list.txt").write_text(f"{line}\n")
-    (name,) = list_files(folder, tmp_path / "out", tmp_path / "list.txt")
+    (name,) = list_photos(folder, tmp_path / "out", tmp_path / "list.txt")
     assert isinstance(resolve_file(folder, name), str)
 
 
 def test_a_list_that_no_file_can_be(tmp_path):
     with pytest.raises(InputError, match="cannot read"):
-        list_files(tmp_path, tmp_path / "out", tmp_path / "a\0b")
+        list_photos(tmp_path, tmp_path / "out", tmp_path / "a\0b")
