@@ -3,19 +3,21 @@
 import ctypes
 import importlib
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cache
+from io import BytesIO
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 import PIL
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError, features
 from PIL.ExifTags import GPS, IFD, Base
+from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, PHOTOMETRIC_INTERPRETATION, ImageFileDirectory_v2
 
 from sfm_app.operating_system import find_in_wheel
 from sfm_app.photos.files import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
@@ -26,6 +28,14 @@ FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
 """Formats that every Pillow can read."""
 LOSSY = ("JPEG", "MPO", "WEBP", "HEIF", "AVIF")
 """Lossy formats: a copy as JPEG loses almost nothing more."""
+TIFF_HEADS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+RAW_HEADS = (b"FUJIFILMCCD-RAW", b"IIRO", b"IIRS", b"MMOR", b"IIU\0", b"FOVb", b"\0MRM", b"II\x1a\0\0\0HEAP")
+"""First bytes of raw photos that are no TIFF: Fujifilm, Olympus, Panasonic, Sigma, Minolta and old Canon."""
+RAW_COLORS = (32803, 34892)
+"""TIFF's colors of sensors: a filter array, and what is made of it before it is developed."""
+RAW_TURNS = {3: 3, 5: 8, 6: 6}
+"""EXIF's orientation by LibRaw's."""
+NEW_SUBFILE_TYPE = 254
 LARGE_PX = 50_000_000
 MOST_FRAMES = 100
 DAMAGED = "truncated or damaged"
@@ -182,30 +192,33 @@ def formats() -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DecodedPhoto:
-    """The first picture of a file."""
+    """The largest picture of a file, the first of several."""
 
     image: Image.Image
     """Decoded, in the orientation stored in the file."""
     exif: Image.Exif
     """Empty if the EXIF is damaged; the picture may still be intact."""
     frames: int
-    """Number of pictures in the file; for a TIFF, counted up to MOST_FRAMES + 1."""
+    """Number of pictures in the file, without previews; for a TIFF, at most MOST_FRAMES + 1."""
 
 
 def read_picture(path: Path) -> DecodedPhoto:
     """Decode a whole file; raise UnreadableError if it is damaged or no photo."""
     try:
-        with Image.open(path, formats=formats()) as image:
+        source, frames = _find_picture(path)
+        if source is None:
+            return _develop(path)
+        with Image.open(source, formats=formats()) as image:
             pixels = image.width * image.height
             if pixels > LARGE_PX and path.stat().st_size < 0.02 * pixels:  # real photos have more bytes per pixel
                 raise UnreadableError("too many pixels for a file of its size")
-            frames = _frame_count(image)
-            image.seek(0)
+            exif = _tiff_exif(path, image) if isinstance(source, BytesIO) else None
             with libtiff_errors() as errors:
                 image.load()
             if errors:
                 raise UnreadableError(DAMAGED)
-            return DecodedPhoto(image, _read_exif(image), frames)
+            frames = frames or (1 if image.format == "MPO" else getattr(image, "n_frames", 1))  # MPO adds previews
+            return DecodedPhoto(image, exif or _read_exif(image.getexif), frames)
     except UnidentifiedImageError:
         raise UnreadableError(_unreadable_reason(path)) from None
     except UnreadableError:
@@ -232,23 +245,89 @@ def large_photo_lock(path: Path) -> Iterator[None]:
         yield
 
 
-def _frame_count(image: Image.Image) -> int:
-    """Return the number of pictures, at most MOST_FRAMES + 1 for a TIFF; 1 for an MPO, which adds previews."""
-    if image.format == "MPO":
-        return 1
-    if image.format != "TIFF":
-        return getattr(image, "n_frames", 1)
-    for frame in range(1, MOST_FRAMES + 1):  # TIFF stores a linked list without its length
-        try:
-            image.seek(frame)
-        except EOFError:
-            return frame
-    return MOST_FRAMES + 1
+# Several pictures in one file: a TIFF may begin with a preview, as raw photos do, which are TIFF files, too.
 
 
-def _read_exif(image: Image.Image) -> Image.Exif:
+def _find_picture(path: Path) -> tuple[Path | BytesIO | None, int]:
+    """Return what holds the largest picture as its first one, and the number of pictures; 0 if Pillow counts them.
+
+    None stands for a raw photo.
+    """
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+        if any(head.startswith(start) for start in RAW_HEADS) or head[4:12] == b"ftypcrx " or head[8:10] == b"CR":
+            return None, 1
+        if head[:4] not in TIFF_HEADS:
+            return path, 0
+        start, length = (8, 8) if head[2:4] in (b"+\0", b"\0+") else (4, 4)  # BigTIFF has long addresses
+        pictures = _list_tiff(file, head[: start + length])
+        if any(tags.get(PHOTOMETRIC_INTERPRETATION) in RAW_COLORS for tags in pictures.values()):
+            return None, 1
+        whole = [place for place, tags in pictures.items() if not _is_preview(tags)] or [*pictures]
+        sizes = [pictures[place].get(IMAGEWIDTH, 0) * pictures[place].get(IMAGELENGTH, 0) for place in whole]
+        chosen = whole[sizes.index(max(sizes))]
+        if chosen == next(iter(pictures)):
+            return path, len(whole)
+        file.seek(0)
+        data = bytearray(file.read())
+    order: Literal["little", "big"] = "little" if head[:2] == b"II" else "big"
+    data[start : start + length] = chosen.to_bytes(length, order)  # the place of the first picture
+    return BytesIO(data), len(whole)
+
+
+def _list_tiff(file: BinaryIO, head: bytes) -> dict[int, ImageFileDirectory_v2]:
+    """Return the tags of each picture of a TIFF by its place, the first one first; at most MOST_FRAMES + 1."""
+    first = ImageFileDirectory_v2(head)
+    waiting, found = [first.next], dict[int, ImageFileDirectory_v2]()
+    while waiting and len(found) <= MOST_FRAMES:
+        place = waiting.pop(0)
+        if place and place not in found:
+            file.seek(place)
+            tags = ImageFileDirectory_v2(head)
+            tags.load(file)
+            found[place] = tags
+            inner = tags.get(Base.SubIFDs, ())
+            waiting += [tags.next, *(inner if isinstance(inner, tuple) else (inner,))]
+    return found
+
+
+def _is_preview(tags: ImageFileDirectory_v2) -> bool:
+    """Return whether a TIFF calls a picture a reduced one or a mask, by the new tag or the old one."""
+    return bool(tags.get(NEW_SUBFILE_TYPE, 0) & 5) or tags.get(Base.SubfileType) == 2
+
+
+def _develop(path: Path) -> DecodedPhoto:
+    """Develop a raw photo with its own white balance; UnreadableError where rawpy is not installed."""
     try:
-        exif = image.getexif()
+        rawpy = importlib.import_module("rawpy")
+    except ImportError:
+        raise UnreadableError("a raw photo: develop it to JPEG or TIFF, or pip install 'sfm-app[raw]'") from None
+    with rawpy.imread(str(path)) as raw:
+        turn = RAW_TURNS.get(raw.sizes.flip, 1)
+        pixels = raw.postprocess(use_camera_wb=True, user_flip=0)
+    exif = _tiff_exif(path)
+    exif[Base.Orientation] = turn
+    return DecodedPhoto(Image.fromarray(pixels), exif, 1)
+
+
+def _tiff_exif(path: Path, inner: Image.Image | None = None) -> Image.Exif:
+    """Return the EXIF of a TIFF, for all its pictures; Pillow turns an inner one by its own orientation."""
+    with path.open("rb") as file:
+
+        def load() -> Image.Exif:
+            exif = Image.Exif()
+            exif.load_from_fp(file)
+            return exif
+
+        exif = _read_exif(load)
+    if inner is not None and Base.Orientation in inner.getexif():
+        exif[Base.Orientation] = 1
+    return exif
+
+
+def _read_exif(load: Callable[[], Image.Exif]) -> Image.Exif:
+    try:
+        exif = load()
         exif.get_ifd(IFD.Exif)
         exif.get_ifd(IFD.GPSInfo)
     except Exception:  # damaged EXIF raises anything

@@ -70,6 +70,8 @@ DERIVED = {
     "dense": "an undistorted copy of another photo", "undistorted": "an undistorted copy of another photo",
 }  # fmt: skip
 """Words in the paths of pictures that programs make of photos. A word alone is no proof; see `_derived_from`."""
+DEVELOPED = (".jpg", ".jpeg", ".heic", ".heif", ".tif", ".tiff", ".png")
+RAW = (".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".x3f", ".3fr")
 MODELS = (".mtl", ".gltf", ".ply", ".dae", ".usda")
 """Suffixes of models that name the pictures of their textures."""
 NAMED_BYTES = 1_000_000
@@ -88,7 +90,7 @@ def list_photos(folder: Path, out: Path, listed_in: Path | None = None, closed: 
         return dict.fromkeys(_read_list(listed_in), "")
     made = _find_made(folder, {place.resolve() for place in (out, *closed)})
     names = list_files(folder, out, (*closed, *(folder / name for name in made)))
-    derived = _derived_from(folder, names) | _textures(folder, names)
+    derived = _derived_from(folder, names) | _textures(folder, names) | _raw_twins(names)
     return dict(sorted((made | dict.fromkeys(names, "") | derived).items()))
 
 
@@ -178,6 +180,17 @@ def _mode_and_width(folder: Path, name: str) -> tuple[str, int]:
             return image.mode, image.width
     except Exception:  # decoders of damaged bytes raise all kinds of errors
         return "", 0
+
+
+def _raw_twins(names: Sequence[str]) -> dict[str, str]:
+    """Return the raw photos that their camera also saved developed, with reasons."""
+    paths = {name: PurePosixPath(name.casefold()) for name in names}
+    developed = {path.with_suffix("") for path in paths.values() if path.suffix in DEVELOPED}
+    return {
+        name: "the raw file of another photo"
+        for name, path in paths.items()
+        if path.suffix in RAW and path.with_suffix("") in developed
+    }
 
 
 def _textures(folder: Path, names: Sequence[str]) -> dict[str, str]:

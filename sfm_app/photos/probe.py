@@ -199,7 +199,7 @@ def _is_read_by_colmap(picture: DecodedPhoto) -> bool:
 def _notes(frames: int, size: tuple[int, int], laid: tuple[int, int], *, panorama: bool) -> tuple[str, ...]:
     """Return notes for people on a file with several pictures, a photo that is scaled down, and a panorama."""
     many = f"its {frames}" if frames <= MOST_FRAMES else f"more than {MOST_FRAMES}"
-    notes = [f"the first of {many} pictures"] if frames > 1 else []
+    notes = [f"the largest of {many} pictures"] if frames > 1 else []
     if laid != size:
         notes.append(f"scaled down from {size[0]} x {size[1]} to {laid[0]} x {laid[1]} pixels")
     if panorama:

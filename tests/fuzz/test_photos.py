@@ -156,7 +156,7 @@ def test_of_very_many_pictures_the_first_is_used(tmp_path):
     (tmp_path / "x.tif").write_bytes(tiff(101))
     (tmp_path / "y.tif").write_bytes(tiff(100))
     notes = [read_photo(tmp_path, name, options=PhotoSettings()).photo.notes for name in ("x.tif", "y.tif")]
-    assert notes == [("the first of more than 100 pictures",), ("the first of its 100 pictures",)]
+    assert notes == [("the largest of more than 100 pictures",), ("the largest of its 100 pictures",)]
 
 
 ACCEPTED = 40

@@ -83,8 +83,9 @@ def test_files_of_other_programs_mark_no_run(folder, files):
 
 @pytest.mark.parametrize(
     ("name", "reason"),
-    [("masks/a.png", "a mask"), ("a_mask.png", "a mask"), ("x/Segment Masks/a.jpg.png", "a mask"), ("mask-a.png", "a mask"),
-     ("depth_maps/a.png", "a depth map"), ("a_depth_0001.png", "a depth map"), ("normals/a.png", "a normal map"),
+    [("masks/a.png", "a mask"), ("a_mask.png", "a mask"), ("x/Segment Masks/a.jpg.png", "a mask"),
+     ("mask-a.png", "a mask"), ("depth_maps/a.png", "a depth map"),
+     ("a_depth_0001.png", "a depth map"), ("normals/a.png", "a normal map"),
      ("images_8/a.png", "a smaller copy"), ("thumbs/a.jpg", "a smaller copy"), ("thumb_a.jpg", "a smaller copy"),
      ("undistorted/images/a.tif", "an undistorted copy"), ("colmap/dense/images/a.jpg", "an undistorted copy")],
 )  # fmt: skip
