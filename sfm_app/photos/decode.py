@@ -5,8 +5,8 @@ import importlib
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
@@ -15,7 +15,7 @@ from typing import Any, BinaryIO, Literal
 import numpy as np
 import PIL
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError, features
+from PIL import Image, ImageCms, UnidentifiedImageError, features
 from PIL.ExifTags import GPS, IFD, Base
 from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, PHOTOMETRIC_INTERPRETATION, ImageFileDirectory_v2
 
@@ -200,6 +200,10 @@ class DecodedPhoto:
     """Empty if the EXIF is damaged; the picture may still be intact."""
     frames: int
     """Number of pictures in the file, without previews; for a TIFF, at most MOST_FRAMES + 1."""
+    recolored: bool = False
+    """True where a color profile was applied, so that the colors are no longer those of the file."""
+    notes: tuple[str, ...] = ()
+    """Remarks for the user about its colors."""
 
 
 def read_picture(path: Path) -> DecodedPhoto:
@@ -218,7 +222,7 @@ def read_picture(path: Path) -> DecodedPhoto:
             if errors:
                 raise UnreadableError(DAMAGED)
             frames = frames or (1 if image.format == "MPO" else getattr(image, "n_frames", 1))  # MPO adds previews
-            return DecodedPhoto(image, exif or _read_exif(image.getexif), frames)
+            return apply_profile(DecodedPhoto(image, exif or _read_exif(image.getexif), frames))
     except UnidentifiedImageError:
         raise UnreadableError(_unreadable_reason(path)) from None
     except UnreadableError:
@@ -335,6 +339,67 @@ def _read_exif(load: Callable[[], Image.Exif]) -> Image.Exif:
     return exif
 
 
+# Colors: numbers mean colors by the profile of the file; all later steps, and COLMAP, take them as sRGB.
+
+SAME_LEVELS = 2
+"""Levels by which colors of an sRGB profile may change in sRGB: several makers rounded it."""
+
+
+IGNORED = "its color profile is damaged or of another kind, and ignored"
+
+
+def apply_profile(picture: DecodedPhoto) -> DecodedPhoto:
+    """Return the picture in sRGB by its color profile; unchanged without one, and with one that is sRGB or damaged."""
+    image = picture.image
+    data = image.info.get("icc_profile") or b""
+    if not data and image.mode != "LAB":
+        return picture
+    try:
+        profile = _open_profile(data)
+        if profile.profile.xcolor_space.strip() == "RGB" and image.mode in ("L", "LA", "P", "PA", "RGB", "RGBA"):
+            image = image.convert("RGBA" if has_alpha(image) else "RGB")
+        change = _find_transform(data, image.mode)
+        if change is None:
+            return picture
+        colored = change.apply(image)
+    except (ImageCms.PyCMSError, ValueError, TypeError, OSError):
+        return replace(picture, notes=(IGNORED,))
+    colored.format = picture.image.format
+    colored.info = {key: value for key, value in image.info.items() if key != "icc_profile"}
+    name = printable_text(ImageCms.getProfileDescription(profile)) or "its color profile"
+    return replace(picture, image=colored, recolored=True, notes=(f"colors converted from {name} to sRGB",))
+
+
+def _open_profile(data: bytes) -> ImageCms.ImageCmsProfile:
+    """Return a profile; without bytes, that of CIE L*a*b*, which needs none."""
+    return ImageCms.ImageCmsProfile(BytesIO(data) if data else ImageCms.createProfile("LAB"))
+
+
+@lru_cache(maxsize=8)
+def _find_transform(data: bytes, mode: str) -> ImageCms.ImageCmsTransform | None:
+    """Return the change of colors from a profile to sRGB; None if that hardly changes any."""
+    change = ImageCms.buildTransform(
+        _open_profile(data),
+        ImageCms.createProfile("sRGB"),
+        mode,
+        mode if mode == "RGBA" else "RGB",
+        ImageCms.Intent.RELATIVE_COLORIMETRIC,
+        ImageCms.Flags.BLACKPOINTCOMPENSATION,
+    )
+    if mode not in ("L", "RGB", "RGBA"):
+        return change
+    levels = np.linspace(0, 255, 18).astype(np.uint8)
+    colors = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(18, -1, 3)
+    probe = Image.fromarray(colors).convert(mode)
+    seen = np.asarray(change.apply(probe).convert("RGB"), int)
+    return change if np.abs(seen - np.asarray(probe.convert("RGB"), int)).max() > SAME_LEVELS else None
+
+
+def has_alpha(image: Image.Image) -> bool:
+    """Return whether pixels of a picture may be transparent."""
+    return image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info
+
+
 def upright_image(picture: DecodedPhoto) -> Image.Image:
     """Return the picture upright by EXIF, in 8-bit RGB or gray, with transparent pixels on white."""
     return undo_exif_orientation(_to_eight_bit(picture.image), orientation(picture.exif))
@@ -366,7 +431,7 @@ def rotate_to_sensor(upright: Image.Image, turn_deg: int) -> Image.Image:
 def _to_eight_bit(image: Image.Image) -> Image.Image:
     if image.mode.startswith("I") or image.mode == "F":
         return Image.fromarray(_to_gray_levels(np.asarray(image)))
-    if image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info:
+    if has_alpha(image):
         white = Image.new("RGBA", image.size, "white")
         return Image.alpha_composite(white, image.convert("RGBA")).convert("RGB")
     return image if image.mode in ("RGB", "L") else image.convert("RGB")

@@ -183,23 +183,24 @@ def describe(name: str, picture: DecodedPhoto, options: PhotoSettings) -> PhotoS
         gps=gps_position(exif),
         lossy=image.format in LOSSY,
         turn_deg=turn,
-        notes=_notes(picture.frames, size, (width, height), panorama=panorama),
+        notes=_notes(picture, size, (width, height), panorama=panorama),
         projection=EQUIRECTANGULAR if panorama else PERSPECTIVE,
     )
     return measure_photo(photo if panorama else replace(photo, shown=_shown_frame(upright, photo)), upright)
 
 
 def _is_read_by_colmap(picture: DecodedPhoto) -> bool:
-    """Return whether COLMAP reads and writes the picture without conversion: 8 bits, opaque and not rotated."""
+    """Return whether COLMAP reads and writes the file as it is: 8 bits, opaque, not rotated and sRGB."""
     image = picture.image
     plain = image.mode in ("RGB", "L") and "transparency" not in image.info
-    return image.format in ("JPEG", "MPO", "PNG") and plain and orientation(picture.exif) == 1
+    kept = plain and not picture.recolored and orientation(picture.exif) == 1
+    return image.format in ("JPEG", "MPO", "PNG") and kept
 
 
-def _notes(frames: int, size: tuple[int, int], laid: tuple[int, int], *, panorama: bool) -> tuple[str, ...]:
-    """Return notes for people on a file with several pictures, a photo that is scaled down, and a panorama."""
-    many = f"its {frames}" if frames <= MOST_FRAMES else f"more than {MOST_FRAMES}"
-    notes = [f"the largest of {many} pictures"] if frames > 1 else []
+def _notes(picture: DecodedPhoto, size: tuple[int, int], laid: tuple[int, int], *, panorama: bool) -> tuple[str, ...]:
+    """Return notes for people on a file of several pictures, its colors, a photo scaled down, and a panorama."""
+    many = f"its {picture.frames}" if picture.frames <= MOST_FRAMES else f"more than {MOST_FRAMES}"
+    notes = [*([f"the largest of {many} pictures"] if picture.frames > 1 else []), *picture.notes]
     if laid != size:
         notes.append(f"scaled down from {size[0]} x {size[1]} to {laid[0]} x {laid[1]} pixels")
     if panorama:
