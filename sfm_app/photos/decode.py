@@ -2,6 +2,7 @@
 
 import ctypes
 import importlib
+import re
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
@@ -175,6 +176,66 @@ def _install_handler() -> None:
         set_handler(ERROR_CALLBACK)
 
 
+# libjpeg only warns of damaged data, which Pillow does not pass on: zeros or the data of another file are decoded to
+# the size of the photo, too. But then the data end before the last row, or go on after it.
+
+SPARE_BYTES = 64
+"""Bytes that cameras may add after the last row; damage nearly always leaves more, or fewer than the rows need."""
+LOOK_AHEAD = bytes(16)
+"""The decoder reads so far ahead. The marker of the end would make it fill missing rows."""
+NEXT_MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
+"""End of the data of a scan: a marker that is neither a zero, which hides a byte of data, nor one of restarts."""
+
+
+def is_whole_jpeg(data: bytes) -> bool:
+    """Return whether the data of a JPEG end with its last row; progressive ones, which have many scans, are not asked.
+
+    Where markers divide the data into intervals, they must be complete.
+    """
+    at, interval, frame = 2, 0, b""
+    while (marker := data[at + 1]) != 0xDA:  # start of the scan
+        if data[at] != 0xFF:
+            return True  # libjpeg goes over bytes between segments
+        if marker == 0xFF:  # fills a gap
+            at += 1
+            continue
+        length = int.from_bytes(data[at + 2 : at + 4], "big")
+        if marker in (0xC0, 0xC1):
+            frame = data[at + 4 : at + 2 + length]
+        if marker == 0xDD:
+            interval = int.from_bytes(data[at + 4 : at + 6], "big")
+        at += 2 + length
+    if not frame or data[at + 4] != frame[5]:  # progressive, or a scan for each color
+        return True
+    end = NEXT_MARKER.search(data, at + 2 + int.from_bytes(data[at + 2 : at + 4], "big"))
+    stop = end.start() if end else len(data)
+    if interval:
+        found = re.findall(rb"\xff([\xd0-\xd7])", data[at:stop])
+        expected = (_count_units(frame) - 1) // interval
+        return found == [bytes([0xD0 + number % 8]) for number in range(expected)]
+    if not _gives_all_rows(data[:stop] + LOOK_AHEAD):
+        return False
+    return stop - at <= 4 * SPARE_BYTES or not _gives_all_rows(data[: stop - SPARE_BYTES])
+
+
+def _count_units(frame: bytes) -> int:
+    """Return the number of units of a JPEG: squares of 8 pixels, or several where colors are coarser."""
+    height, width = int.from_bytes(frame[1:3], "big"), int.from_bytes(frame[3:5], "big")
+    factors = [(frame[7 + 3 * k] >> 4, frame[7 + 3 * k] & 15) for k in range(frame[5])]
+    across, down = (8 * max(pair) for pair in zip(*factors, strict=True)) if len(factors) > 1 else (8, 8)
+    return -(-width // across) * -(-height // down)
+
+
+def _gives_all_rows(data: bytes) -> bool:
+    try:
+        with Image.open(BytesIO(data), formats=("JPEG",)) as image:
+            image.draft("L", (1, 1))  # the smallest that the decoder makes, for speed
+            image.load()
+    except OSError:
+        return False
+    return True
+
+
 class UnreadableError(Exception):
     """A file gives no picture; the message, for people, says why."""
 
@@ -219,7 +280,7 @@ def read_picture(path: Path) -> DecodedPhoto:
             exif = _tiff_exif(path, image) if isinstance(source, BytesIO) else None
             with libtiff_errors() as errors:
                 image.load()
-            if errors:
+            if errors or (image.format in ("JPEG", "MPO") and not is_whole_jpeg(path.read_bytes())):
                 raise UnreadableError(DAMAGED)
             frames = frames or (1 if image.format == "MPO" else getattr(image, "n_frames", 1))  # MPO adds previews
             return apply_profile(DecodedPhoto(image, exif or _read_exif(image.getexif), frames))

@@ -36,8 +36,8 @@ def profile(space=b"RGB ", gamma=2.2, matrix=P3):
         for letter, column in zip("rgb", (D65_TO_D50 @ matrix).T, strict=True):
             tags |= {f"{letter}XYZ".encode(): b"XYZ " + bytes(4) + fixed(*column), f"{letter}TRC".encode(): curve}
     table, data = struct.pack(">I", len(tags)), b""
-    for tag, value in tags.items():
-        value += bytes(-len(value) % 4)
+    for tag, unpadded in tags.items():
+        value = unpadded + bytes(-len(unpadded) % 4)
         table += tag + struct.pack(">II", 132 + 12 * len(tags) + len(data), len(value))
         data += value
     head = struct.pack(">I4sI4s4s4s", 132 + 12 * len(tags) + len(data), b"", 0x02400000, b"mntr", space, b"XYZ ")
