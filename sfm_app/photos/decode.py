@@ -13,6 +13,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, BinaryIO, Literal
 
+import cv2
 import numpy as np
 import PIL
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, PHOTOMETRIC_INTERPRETAT
 from sfm_app.operating_system import find_in_wheel
 from sfm_app.photos.files import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
 from sfm_app.types import CameraPrior, GpsPosition
+from sfm_app.types.arrays import BoolArray
 from sfm_app.types.photos import EXIF
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
@@ -461,8 +463,31 @@ def has_alpha(image: Image.Image) -> bool:
     return image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info
 
 
+OPAQUE = 224
+"""Least alpha of a pixel that belongs to the photo: below, at soft edges, the background shows through."""
+
+
+def opaque_pixels(image: Image.Image) -> BoolArray:
+    """Return the (H, W) pixels of a picture that are not transparent."""
+    if not has_alpha(image):
+        return np.full((image.height, image.width), True)
+    return np.asarray(image.convert("RGBA").getchannel("A")) >= OPAQUE
+
+
+def fill_masked(pixels: NDArray[np.uint8], used: BoolArray) -> NDArray[np.uint8]:
+    """Return an RGB photo whose masked pixels have the color of the nearest usable one, for interpolation."""
+    if used.all() or not used.any():
+        return pixels
+    hidden = (~used).view(np.uint8)
+    _, nearest = cv2.distanceTransformWithLabels(hidden, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    seeds = np.flatnonzero(used)
+    place = np.zeros(len(seeds) + 1, np.int64)  # labels count from 1
+    place[nearest.ravel()[seeds]] = seeds
+    return np.asarray(pixels.reshape(-1, 3)[place[nearest]])
+
+
 def upright_image(picture: DecodedPhoto) -> Image.Image:
-    """Return the picture upright by EXIF, in 8-bit RGB or gray, with transparent pixels on white."""
+    """Return the picture upright by EXIF, in 8-bit RGB or gray; transparent pixels take the color beside them."""
     return undo_exif_orientation(_to_eight_bit(picture.image), orientation(picture.exif))
 
 
@@ -493,8 +518,8 @@ def _to_eight_bit(image: Image.Image) -> Image.Image:
     if image.mode.startswith("I") or image.mode == "F":
         return Image.fromarray(_to_gray_levels(np.asarray(image)))
     if has_alpha(image):
-        white = Image.new("RGBA", image.size, "white")
-        return Image.alpha_composite(white, image.convert("RGBA")).convert("RGB")
+        colors = np.asarray(image.convert("RGBA"))[..., :3]
+        return Image.fromarray(fill_masked(colors, opaque_pixels(image)))
     return image if image.mode in ("RGB", "L") else image.convert("RGB")
 
 

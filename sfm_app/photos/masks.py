@@ -9,13 +9,18 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.errors import InputError
-from sfm_app.photos.decode import UnreadableError, orientation, read_picture, rotate_to_sensor, undo_exif_orientation
+from sfm_app.photos.decode import (
+    UnreadableError,
+    opaque_pixels,
+    orientation,
+    read_picture,
+    rotate_to_sensor,
+    undo_exif_orientation,
+)
 from sfm_app.photos.files import list_files, resolve_file
 from sfm_app.types import Photo, UnusablePhoto
 from sfm_app.types.arrays import BoolArray
@@ -52,9 +57,13 @@ def unused_masks(names: Sequence[str], photos: Sequence[Photo]) -> list[str]:
     return [name for name in names if name not in used and not PurePosixPath(name).name.startswith(".")]
 
 
-def lay_out_mask(photo: Photo, folder: Path, masks: Path, target: Path) -> None:
+def lay_out_mask(photo: Photo, folder: Path, masks: Path | None, target: Path) -> None:
     """Write the mask of a laid-out photo; all white without one, since COLMAP skips photos without a mask."""
-    used = _load_fitted_mask(photo, folder, masks) if photo.mask else np.full((photo.height, photo.width), True)
+    used = np.full((photo.height, photo.width), True)
+    if photo.mask and masks is not None:
+        used &= _load_fitted_mask(photo, folder, masks)
+    if photo.cut_out:
+        used &= _load_opaque(photo, folder)
     save_mask(target, photo.name, used)
 
 
@@ -76,18 +85,6 @@ def read_mask(target: Path, name: str) -> BoolArray:
         return np.asarray(image) > 0
 
 
-def fill_masked(pixels: NDArray[np.uint8], used: BoolArray) -> NDArray[np.uint8]:
-    """Return an RGB photo whose masked pixels have the color of the nearest usable one, for interpolation."""
-    if used.all() or not used.any():
-        return pixels
-    hidden = (~used).view(np.uint8)
-    _, nearest = cv2.distanceTransformWithLabels(hidden, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    seeds = np.flatnonzero(used)
-    place = np.zeros(len(seeds) + 1, np.int64)  # labels count from 1
-    place[nearest.ravel()[seeds]] = seeds
-    return np.asarray(pixels.reshape(-1, 3)[place[nearest]])
-
-
 def _load_fitted_mask(photo: Photo, folder: Path, masks: Path) -> BoolArray:
     """Return the (H, W) usable pixels of the laid-out photo."""
     try:
@@ -103,6 +100,17 @@ def _load_fitted_mask(photo: Photo, folder: Path, masks: Path) -> BoolArray:
         raise InputError(f"the mask {photo.mask} cannot be used: {err}", hint=MASK_HINT) from err
     fitted = mask if mask.size == size else mask.resize(size, Image.Resampling.NEAREST)
     return np.asarray(rotate_to_sensor(fitted, photo.turn_deg)) > 0
+
+
+def _load_opaque(photo: Photo, folder: Path) -> BoolArray:
+    """Return the (H, W) opaque pixels of the laid-out photo."""
+    source = resolve_file(folder, photo.path)
+    if isinstance(source, str):
+        raise InputError(f"{photo.path} has changed while it was read: {source}")
+    picture = read_picture(source)
+    opaque = undo_exif_orientation(Image.fromarray(opaque_pixels(picture.image)), orientation(picture.exif))
+    upright = (photo.height, photo.width) if photo.turn_deg in (90, 270) else (photo.width, photo.height)
+    return np.asarray(rotate_to_sensor(opaque.resize(upright, Image.Resampling.NEAREST), photo.turn_deg))
 
 
 def _orient_mask(photo: Photo, size: tuple[int, int], mask: Image.Image, folder: Path) -> Image.Image:

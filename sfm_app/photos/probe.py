@@ -18,6 +18,7 @@ from sfm_app.photos.decode import (
     exif_prior,
     gps_position,
     large_photo_lock,
+    opaque_pixels,
     orientation,
     read_picture,
     rotate_to_sensor,
@@ -171,6 +172,9 @@ def describe(name: str, picture: DecodedPhoto, options: PhotoSettings) -> PhotoS
     size = image.size[::-1] if orientation(exif) >= 5 and not turn else image.size
     if min(size) < options.min_side_px:
         return UnusablePhoto(name, f"smaller than {options.min_side_px} px")
+    opaque = opaque_pixels(image)
+    if not opaque.any():
+        return UnusablePhoto(name, "transparent all over")
     share = min(1.0, (options.max_megapixels * 1_000_000 / (size[0] * size[1])) ** 0.5)
     width, height = max(1, int(size[0] * share)), max(1, int(size[1] * share))
     photo = Photo(
@@ -185,6 +189,7 @@ def describe(name: str, picture: DecodedPhoto, options: PhotoSettings) -> PhotoS
         turn_deg=turn,
         notes=_notes(picture, size, (width, height), panorama=panorama),
         projection=EQUIRECTANGULAR if panorama else PERSPECTIVE,
+        cut_out=not opaque.all(),
     )
     return measure_photo(photo if panorama else replace(photo, shown=_shown_frame(upright, photo)), upright)
 

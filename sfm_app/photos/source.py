@@ -51,11 +51,11 @@ class Source:
     def content_hash(self, photos: PhotoSet) -> str:
         """Return a hash of the used photos and their masks, without camera groups, which do not affect features."""
         used = [self._content(photo) | {"group": ""} for photo in photos.photos]
-        return fingerprint(used, photos.masks is not None)
+        return fingerprint(used, photos.has_masks)
 
     def photo_hashes(self, photos: PhotoSet) -> dict[str, str]:
         """Return a hash of the bytes, mask, size and camera group of each used photo, by name."""
-        return {photo.name: fingerprint(self._content(photo), photos.masks is not None) for photo in photos.photos}
+        return {photo.name: fingerprint(self._content(photo), photos.has_masks) for photo in photos.photos}
 
     def _content(self, photo: Photo) -> dict[str, Any]:
         """Return all values of a photo that results depend on."""

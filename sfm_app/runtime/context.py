@@ -114,8 +114,8 @@ class RunContext:
 
     @property
     def mask_dir(self) -> Path | None:
-        """Folder of the masks; None without masks."""
-        return self.workspace.masks if self.settings.photos.masks else None
+        """Folder of the masks that the photos are laid out with; None without masks."""
+        return self.workspace.masks if self.workspace.masks.is_dir() else None
 
     def map(self, function: Callable[[Item], Result], items: Sequence[Item], label: str) -> list[Result]:
         """Return results in the order of the items, computed in parallel, with a progress bar of this label."""

@@ -184,9 +184,10 @@ def _read_photos(
     for place in (run.workspace.photos, run.workspace.masks):
         shutil.rmtree(place, ignore_errors=True)
     run.map(Task(lay_out_photo, folder=folder, target=run.workspace.photos), photo_set.photos, "laying photos out")
-    if (masks := source.mask_dir) is not None:
-        lay_out = Task(lay_out_mask, folder=photo_set.folder, masks=masks, target=run.workspace.masks)
+    if photo_set.has_masks:
+        lay_out = Task(lay_out_mask, folder=folder, masks=source.mask_dir, target=run.workspace.masks)
         run.map(lay_out, photo_set.photos, "laying masks out")
+    if source.mask_dir is not None:
         unused = unused_masks(list(source.masks), photo_set.photos)
         run.record(masks={"photos": sum(bool(photo.mask) for photo in photo_set.photos), "unused": unused})
     copies = {photo.name: _copy_digest(photo, run) for photo in photo_set.photos}
@@ -262,7 +263,7 @@ def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoS
             if folder == run.workspace.frames and not (folder / photo.path).exists():
                 raise FileNotFoundError(errno.ENOENT, "no such frame", str(folder / photo.path))
             lay_out_photo(photo, folder=folder, target=run.workspace.photos)
-        if masks is not None and not mask_path(run.workspace.masks, photo.name).exists():
+        if photo_set.has_masks and not mask_path(run.workspace.masks, photo.name).exists():
             lay_out_mask(photo, folder, masks, run.workspace.masks)
     return photo_set
 

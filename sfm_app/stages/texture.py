@@ -11,7 +11,8 @@ from PIL import Image
 
 from sfm_app.files import fingerprint, load_arrays, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.meshing.ray_casting import NearestNormals, Occluders
-from sfm_app.photos.masks import fill_masked, read_mask
+from sfm_app.photos.decode import fill_masked
+from sfm_app.photos.masks import read_mask
 from sfm_app.photos.panoramas import mask_part, panorama_parts, show_part
 from sfm_app.products import write_texture
 from sfm_app.runtime.context import RunContext

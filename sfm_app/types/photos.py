@@ -120,6 +120,8 @@ class Photo:
     """The picture inside bars of one color, in the sensor's orientation; None without bars."""
     mask: str = ""
     """Path of its mask inside the folder of masks; empty where it has none."""
+    cut_out: bool = False
+    """True where pixels of the file are transparent, which masks them."""
     projection: str = "perspective"
     """"equirectangular" for a panorama, "perspective" for every other photo, also for fisheyes: matches show those."""
     time_s: float | None = None
@@ -160,6 +162,12 @@ class PhotoSet:
     photos: tuple[Photo, ...]
     unusable: tuple[UnusablePhoto, ...] = ()
     masks: Path | None = None
+    """The user's folder of masks."""
+
+    @property
+    def has_masks(self) -> bool:
+        """Whether all photos are laid out with a mask, by files or by transparent pixels of some."""
+        return self.masks is not None or any(photo.cut_out for photo in self.photos)
 
     @property
     def groups(self) -> dict[str, tuple[Photo, ...]]:

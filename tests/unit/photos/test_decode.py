@@ -75,12 +75,14 @@ def test_floating_point_fills_the_range(tmp_path):
     assert np.abs(seen - BARS.astype(int) * 255 / 248).max() <= 1
 
 
-def test_what_is_transparent_is_white(tmp_path):
-    clear = np.dstack([COLORS, np.where(BARS < 128, 0, 255).astype(np.uint8)])
+@pytest.mark.parametrize("alpha", [0, 200])
+def test_what_is_transparent_takes_the_color_beside_it(tmp_path, alpha):
+    clear = np.dstack([COLORS, np.where(BARS < 128, alpha, 255).astype(np.uint8)])
+    clear[:, :16, :3] = 255
     Image.fromarray(clear).save(tmp_path / "x.png")
     seen = decoded(tmp_path / "x.png")
-    assert (seen[:, :16] == 255).all()
     assert np.array_equal(seen[:, 16:], COLORS[:, 16:])
+    assert np.abs(seen[:, :16] - COLORS[:, 16:17]).max() < 8  # nothing is white
 
 
 @pytest.mark.parametrize("kind", ["TIFF", "PNG", "WEBP"])

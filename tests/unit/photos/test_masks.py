@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from sfm_app.photos.masks import fill_masked, find_mask, lay_out_mask, list_masks, read_mask, unused_masks
+from sfm_app.photos.decode import fill_masked
+from sfm_app.photos.masks import find_mask, lay_out_mask, list_masks, read_mask, unused_masks
 from sfm_app.types import Photo
 
 USED = np.zeros((40, 60), bool)

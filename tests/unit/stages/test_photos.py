@@ -5,6 +5,7 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
+from sfm_app.photos.masks import read_mask
 from sfm_app.photos.probe import read_photo
 from sfm_app.photos.source import read_source
 from sfm_app.plugins import load_plugins
@@ -177,3 +178,80 @@ def test_a_folder_of_very_many_files_may_be_another_than_meant(folder, run, monk
     monkeypatch.setattr(run.progress, "say", said.append)
     make(folder, run)
     assert [line[: len(told[0])] for line in said] == told if told else said == []
+
+
+VISIBLE = np.zeros((96, 128), bool)
+VISIBLE[20:80, 30:100] = True
+
+
+def cut_out(kind):
+    alpha = Image.fromarray(np.where(VISIBLE, np.uint8(255), np.uint8(30)))
+    image = Image.fromarray(PIXELS).convert("L" if kind == "LA" else "RGB")
+    if kind == "palette":
+        pixels = np.where(VISIBLE, np.asarray(image.quantize(100)) + 1, 0).astype(np.uint8)
+        colors = image.quantize(100).getpalette()
+        image = Image.fromarray(pixels, "P")
+        image.putpalette([9, 9, 9, *colors])
+        image.info["transparency"] = 0
+    elif kind == "color":
+        image.paste((1, 2, 3), mask=Image.fromarray(~VISIBLE))
+        image.info["transparency"] = (1, 2, 3)
+    else:
+        image.putalpha(alpha)
+    return image
+
+
+def laid_mask(run, name):
+    return read_mask(run.workspace.masks, name)
+
+
+@pytest.mark.parametrize("kind", ["RGBA", "LA", "palette", "color"])
+def test_transparent_pixels_are_masked_in_all_later_stages(folder, run, kind):
+    assert run.mask_dir is None
+    cut_out(kind).save(folder / "c.png")
+    found = make(folder, run)
+    assert [photo.cut_out for photo in found.photos] == [False, False, True]
+    assert run.mask_dir == run.workspace.masks
+    assert np.array_equal(laid_mask(run, "c.png"), VISIBLE) and laid_mask(run, "a.jpg").all()
+    with Image.open(run.workspace.photos / "c.png") as laid:
+        assert laid.mode == "RGB"
+    (run.workspace.masks / "c.png.png").unlink()
+    assert load(folder, run) == found
+    assert np.array_equal(laid_mask(run, "c.png"), VISIBLE)
+    (folder / "c.png").unlink()
+    make(folder, run)
+    assert run.mask_dir is None
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 7])
+def test_transparent_pixels_of_turned_photos_lie_on_the_laid_out_photo(folder, run, orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    pixels = np.full((96, 128, 4), np.uint8(255))
+    pixels[..., 3] = np.where(VISIBLE, 255, 0)
+    pixels[20:40, 30:50, :3] = 90
+    image = Image.fromarray(pixels)
+    image.save(folder / "c.png", exif=exif)
+    photo = next(photo for photo in make(folder, run).photos if photo.name == "c.png")
+    mask = laid_mask(run, "c.png")
+    laid = np.asarray(Image.open(run.workspace.photos / "c.png"))[..., 0]
+    assert mask.shape == laid.shape == (photo.height, photo.width) and mask.sum() == VISIBLE.sum()
+    rows, columns = np.nonzero(mask)
+    corners = [laid[y, x] for y in (rows.min(), rows.max()) for x in (columns.min(), columns.max())]
+    assert sorted(corners) == [90, 255, 255, 255]
+
+
+def test_a_mask_and_transparent_pixels_both_hold(folder, run, tmp_path):
+    cut_out("RGBA").save(folder / "c.png")
+    upper = np.zeros((96, 128), np.uint8)
+    upper[:50] = 255
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(upper).save(tmp_path / "masks" / "c.png")
+    run = replace(run, settings=Settings.from_mapping({"photos": {"masks": str(tmp_path / "masks")}}))
+    make(folder, run)
+    assert np.array_equal(laid_mask(run, "c.png"), VISIBLE & (upper > 0))
+
+
+def test_a_photo_that_is_transparent_all_over_is_left_out(folder, run):
+    Image.new("RGBA", (128, 96), (9, 9, 9, 0)).save(folder / "c.png")
+    assert {one.name: one.reason for one in make(folder, run).unusable} == {"c.png": "transparent all over"}
