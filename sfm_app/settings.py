@@ -44,7 +44,7 @@ class PhotoSettings(Section):
 
     images: str = Field("", description="text file that names the photos to use, one per line; all where empty")
     masks: str = Field(
-        "", description="folder of masks: black areas of sub/a.jpg.png are left out of sub/a.jpg; none where empty"
+        "", description="folder of masks, such as sub/a.jpg.png, or one mask of all photos; black areas are left out"
     )
     cameras: Literal["auto", "single", "folder", "each"] = Field(
         "auto",

@@ -198,6 +198,8 @@ def _photo_lines(photos: Mapping[str, Any]) -> Iterator[str]:
 
 def _mask_lines(masks: Mapping[str, Any], photos: int) -> Iterator[str]:
     yield f"masks       {masks['photos']} of {photos} photos"
+    if masks.get("white"):
+        yield f"{INDENT}hiding nothing: {_abbreviate_names(masks['white'])}"
     if masks["unused"]:
         yield f"{INDENT}unused: {_abbreviate_names(masks['unused'])}"
 

@@ -1,11 +1,11 @@
 """Read and write masks, which mark the usable pixels of a photo, in COLMAP's naming and format.
 
-The mask of `sub/a.jpg` is `sub/a.jpg.png` or `sub/a.png` in a separate folder; black or transparent pixels are not
-used. A mask belongs to the upright photo, as displayed.
+The mask of `sub/a.jpg` is `sub/a.jpg.png`, `sub/a.png` or `sub/a_mask.png` in a separate folder, also as JPEG; black or
+transparent pixels are not used. A mask belongs to the upright photo, as displayed. A single file without the name of a
+photo is the mask of all.
 """
 
-import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -14,6 +14,7 @@ from PIL import Image
 
 from sfm_app.errors import InputError
 from sfm_app.photos.decode import (
+    LOSSY,
     UnreadableError,
     opaque_pixels,
     orientation,
@@ -26,29 +27,61 @@ from sfm_app.types import Photo, UnusablePhoto
 from sfm_app.types.arrays import BoolArray
 
 ENDING = ".png"
-MASK_HINT = "the mask of sub/a.jpg is sub/a.jpg.png or sub/a.png in the folder of masks, of the size of the photo"
+MASK_HINT = (
+    "the mask of sub/a.jpg is sub/a.jpg.png, sub/a.png or sub/a_mask.png in the folder of masks, of the shape of the "
+    "photo; a single file masks all photos"
+)
+ALL_BLACK = "its mask is all black"
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+SPELLINGS = ("{}", "{}_mask", "{}-mask", "{}.mask", "mask_{}", "mask-{}")
+NEAR_BLACK = 64
+"""Level below which white of a mask counts as a label, and a quarter of which still counts as black otherwise.
+
+JPEG makes a black area beside a white one up to 60 levels brighter. By hand.
+"""
 
 
-def list_masks(masks: Path, photos: Path, out: Path) -> list[str]:
-    """Return the files below the folder of masks, as `list_files` does; raise an InputError if it cannot be used."""
-    if not masks.is_dir():
-        problem = "not a folder" if masks.exists() else "no such folder"
-        raise InputError(f"{problem} of masks: {masks}", hint=MASK_HINT)
-    if masks.resolve() == photos.resolve():
+def split_mask_path(masks: str) -> tuple[Path, str]:
+    """Return the folder of masks, and the name of the mask of all photos where a file is given."""
+    path = Path(masks)
+    return (path.resolve().parent, path.resolve().name) if path.is_file() else (path, "")
+
+
+def list_masks(masks: str, photos: Path, out: Path) -> list[str]:
+    """Return the files below the folder of masks, or the given one; raise an InputError if it cannot be used."""
+    folder, name = split_mask_path(masks)
+    if name:
+        return [name]
+    if not folder.is_dir():
+        raise InputError(f"no such folder of masks: {masks}", hint=MASK_HINT)
+    if folder.resolve() == photos.resolve():
         raise InputError(f"the masks lie among the photos in {photos}", hint="give the masks a folder of their own")
-    return list_files(masks, out, (photos,))
+    return list_files(folder, out, (photos,))
 
 
-def find_mask(photo: Photo, folder: Path, masks: Path) -> Photo | UnusablePhoto:
-    """Return the photo with its mask, if any, unusable if that is all black; InputError if the mask cannot be used."""
-    names = f"{photo.path}{ENDING}", str(PurePosixPath(photo.path).with_suffix(ENDING))
-    name = next((name for name in names if os.path.lexists(masks / name)), "")
-    if not name:
+def assign_masks(photos: Sequence[Photo], names: Collection[str], *, for_all: bool = False) -> list[Photo]:
+    """Return the photos with the names of their masks; empty names where they have none.
+
+    The one file of `for_all` is the mask of all, and so is one that is alone in its folder and has no photo's name.
+    """
+    visible = {name for name in names if not PurePosixPath(name).name.startswith(".")}
+    assigned = [replace(photo, mask=_find_mask(photo.path, visible)) for photo in photos]
+    is_alone = len(visible) == 1 and "/" not in "".join(visible) and not any(photo.mask for photo in assigned)
+    return [replace(photo, mask=min(visible)) for photo in photos] if for_all or is_alone else assigned
+
+
+def _find_mask(path: str, names: Collection[str]) -> str:
+    place = PurePosixPath(path)
+    bases = [spelling.format(base) for spelling in SPELLINGS for base in (place.name, place.stem)]
+    spelled = (str(place.with_name(base + suffix)) for suffix in SUFFIXES for base in bases)
+    return next((name for name in spelled if name in names), "")
+
+
+def check_mask(photo: Photo, folder: Path, masks: Path) -> Photo | UnusablePhoto:
+    """Return the photo, unusable if nothing of it is left; raise an InputError if its mask cannot be used."""
+    if not photo.mask or usable_pixels(photo, folder, masks).any():
         return photo
-    masked = replace(photo, mask=name)
-    if not np.any(_load_fitted_mask(masked, folder, masks)):
-        return UnusablePhoto(photo.path, f"its mask {name} is all black")
-    return masked
+    return UnusablePhoto(photo.path, ALL_BLACK)
 
 
 def unused_masks(names: Sequence[str], photos: Sequence[Photo]) -> list[str]:
@@ -57,14 +90,19 @@ def unused_masks(names: Sequence[str], photos: Sequence[Photo]) -> list[str]:
     return [name for name in names if name not in used and not PurePosixPath(name).name.startswith(".")]
 
 
-def lay_out_mask(photo: Photo, folder: Path, masks: Path | None, target: Path) -> None:
-    """Write the mask of a laid-out photo; all white without one, since COLMAP skips photos without a mask."""
+def lay_out_mask(photo: Photo, folder: Path, masks: Path | None, target: Path) -> bool:
+    """Write the mask of a laid-out photo, all white without one, and return whether it hides anything."""
+    used = usable_pixels(photo, folder, masks)  # COLMAP skips photos without a mask
+    save_mask(target, photo.name, used)
+    return not used.all()
+
+
+def usable_pixels(photo: Photo, folder: Path, masks: Path | None) -> BoolArray:
+    """Return the (H, W) pixels of a laid-out photo that its mask and its transparency leave."""
     used = np.full((photo.height, photo.width), True)
     if photo.mask and masks is not None:
         used &= _load_fitted_mask(photo, folder, masks)
-    if photo.cut_out:
-        used &= _load_opaque(photo, folder)
-    save_mask(target, photo.name, used)
+    return used & _load_opaque(photo, folder) if photo.cut_out else used
 
 
 def mask_path(target: Path, name: str) -> Path:
@@ -130,14 +168,17 @@ def _has_same_aspect(one: tuple[int, int], other: tuple[int, int]) -> bool:
 
 
 def _binarize(image: Image.Image) -> Image.Image:
-    """Return white where any channel is nonzero and the pixel is opaque."""
+    """Return white where any channel is brighter than nearly black, and the pixel is opaque."""
     if image.mode.startswith("I") or image.mode == "F":
-        used = np.asarray(image) != 0
+        levels = np.asarray(image)
+        opaque = np.full(levels.shape, True)
     else:
         plain = image.convert("RGB") if image.mode in ("CMYK", "YCbCr", "LAB", "HSV") else image
         channels = np.asarray(plain.convert("RGBA"))
-        used = channels[..., :3].any(axis=2) & (channels[..., 3] > 0)
-    return _black_and_white(used)
+        levels, opaque = channels[..., :3].max(axis=2), channels[..., 3] >= NEAR_BLACK
+    brightest = float(levels.max())
+    is_labels = brightest < NEAR_BLACK and image.format not in LOSSY  # 0 and 1, say
+    return _black_and_white((levels > (0.0 if is_labels else max(brightest, NEAR_BLACK) / 4.0)) & opaque)
 
 
 def _black_and_white(used: BoolArray) -> Image.Image:

@@ -15,7 +15,7 @@ from sfm_app.files import digest_file, fingerprint, is_below
 from sfm_app.operating_system import is_link, link_or_copy
 from sfm_app.photos.decode import UnreadableError, large_photo_lock, read_picture, rotate_to_sensor, upright_image
 from sfm_app.photos.files import is_video, list_photos, read_head, resolve_file
-from sfm_app.photos.masks import list_masks
+from sfm_app.photos.masks import list_masks, split_mask_path
 from sfm_app.settings import PhotoSettings
 from sfm_app.types import Photo, PhotoSet
 
@@ -40,13 +40,15 @@ class Source:
     mask_dir: Path | None
     masks: Mapping[str, str]
     """Hashes of the masks by name."""
+    one_mask: bool
+    """True where the user gave one file for all photos."""
     stamps: Mapping[Path, Stamp]
     """Sizes and times of the files, to detect later changes."""
 
     @property
     def fingerprint(self) -> str:
         """Hash of the path, the files and the masks."""
-        return fingerprint(str(self.path.resolve()), self.files, self.left_out, self.masks)
+        return fingerprint(str(self.path.resolve()), self.files, self.left_out, self.masks, self.one_mask)
 
     def content_hash(self, photos: PhotoSet) -> str:
         """Return a hash of the used photos and their masks, without camera groups, which do not affect features."""
@@ -79,19 +81,24 @@ class Source:
 
 def read_source(path: Path, out: Path, options: PhotoSettings, spread: ParallelMap) -> Source:
     """List the input files and compute their hashes; raise an InputError if the photos or the masks cannot be used."""
-    video, mask_dir = is_video(read_head(path)), Path(options.masks) if options.masks else None
+    video = is_video(read_head(path))
+    mask_dir, one_mask = split_mask_path(options.masks) if options.masks else (None, "")
     listed = Path(options.images) if options.images else None
     if video and listed is not None:
         raise ConfigError("--images lists photos of a folder, not frames of a video", hint="leave --images out")
-    found = {"": ""} if video else list_photos(path, out, listed, closed=() if mask_dir is None else (mask_dir,))
+    closed = () if mask_dir is None or one_mask else (mask_dir,)
+    found = {"": ""} if video else list_photos(path, out, listed, closed)
+    if one_mask:
+        mask = Path(options.masks).resolve()
+        found |= {name: "the mask of all photos" for name in found if (path / name).resolve() == mask}
     names = [name for name, reason in found.items() if not reason]
     left_out = {name: reason for name, reason in found.items() if reason}
-    mask_names = [] if mask_dir is None else list_masks(mask_dir, path, out)
+    mask_names = list_masks(options.masks, path, out) if options.masks else []
     paths = [path / name for name in names] + [mask_dir / name for name in mask_names if mask_dir is not None]
     stamps = {file: stamp for file in paths if (stamp := _stamp(file)) is not None}
     files = {"": digest(path)} if video else _digests(path, names, spread)
     masks = {} if mask_dir is None else _digests(mask_dir, mask_names, spread)
-    return Source(path, video, files, left_out, mask_dir, masks, stamps)
+    return Source(path, video, files, left_out, mask_dir, masks, bool(one_mask), stamps)
 
 
 def digest(file: Path) -> str:

@@ -15,7 +15,7 @@ from sfm_app.files import digest_files, replace_atomically
 from sfm_app.operating_system import is_link
 from sfm_app.photos.decode import UnreadableError
 from sfm_app.photos.files import list_files
-from sfm_app.photos.masks import MASK_HINT, find_mask, lay_out_mask, mask_path, unused_masks
+from sfm_app.photos.masks import MASK_HINT, assign_masks, check_mask, lay_out_mask, mask_path, unused_masks
 from sfm_app.photos.probe import group_by_camera, read_photo, split_by_given_camera
 from sfm_app.photos.selection import PhotoStats, drop_duplicates, drop_unusable, read_stats, write_stats
 from sfm_app.photos.source import Source, assign_names, is_laid_out, lay_out
@@ -186,10 +186,8 @@ def _read_photos(
     run.map(Task(lay_out_photo, folder=folder, target=run.workspace.photos), photo_set.photos, "laying photos out")
     if photo_set.has_masks:
         lay_out = Task(lay_out_mask, folder=folder, masks=source.mask_dir, target=run.workspace.masks)
-        run.map(lay_out, photo_set.photos, "laying masks out")
-    if source.mask_dir is not None:
-        unused = unused_masks(list(source.masks), photo_set.photos)
-        run.record(masks={"photos": sum(bool(photo.mask) for photo in photo_set.photos), "unused": unused})
+        hiding = run.map(lay_out, photo_set.photos, "laying masks out")
+        run.record(masks=_mask_counts(photo_set.photos, hiding, list(source.masks)))
     copies = {photo.name: _copy_digest(photo, run) for photo in photo_set.photos}
     write_photo_list(photo_set, copies, run.workspace)
     run.record(usable=len(photos), cameras=len(photo_set.groups), unusable={p.name: p.reason for p in unusable})
@@ -230,11 +228,19 @@ def attach_masks(
     masks = source.mask_dir
     if masks is None:
         return stats, []
-    photos = run.map(Task(find_mask, folder=folder, masks=masks), [one.photo for one in stats], "masks")
-    if stats and all(isinstance(photo, Photo) and not photo.mask for photo in photos):
+    assigned = assign_masks([one.photo for one in stats], source.masks, for_all=source.one_mask)
+    if stats and not any(photo.mask for photo in assigned):
         raise InputError(f"none of the {len(source.masks)} files in {masks} is the mask of a photo", hint=MASK_HINT)
+    photos = run.map(Task(check_mask, folder=folder, masks=masks), assigned, "masks")
     used = [replace(one, photo=photo) for one, photo in zip(stats, photos, strict=True) if isinstance(photo, Photo)]
     return used, [photo for photo in photos if isinstance(photo, UnusablePhoto)]
+
+
+def _mask_counts(photos: Sequence[Photo], hiding: Sequence[bool], names: list[str]) -> dict[str, Any]:
+    """Return the manifest's entry: photos with a mask, those whose mask hides nothing, and files that are no mask."""
+    white = [photo.path for photo, hides in zip(photos, hiding, strict=True) if photo.mask and not hides]
+    masked = sum(bool(photo.mask or photo.cut_out) for photo in photos)
+    return {"photos": masked, "unused": unused_masks(names, photos)} | ({"white": white} if white else {})
 
 
 def lay_out_photo(photo: Photo, *, folder: Path, target: Path) -> None:

@@ -71,7 +71,7 @@ def test_masks_beside_the_photos_in_a_folder_of_their_own_are_no_photos(folder, 
 def test_a_photo_whose_mask_is_black_is_left_out_with_the_reason(folder, masks, tmp_path):
     Image.new("L", SIZE).save(masks / "a.png")
     found = json.loads(read(folder, tmp_path / "out", "--json").stdout)
-    assert found["photos"]["unusable"] == {"a.jpg": "its mask a.png is all black"}
+    assert found["photos"]["unusable"] == {"a.jpg": "its mask is all black"}
     assert not (tmp_path / "out" / "masks" / "a.jpg.png").exists()
 
 
@@ -115,7 +115,7 @@ def linked(target):
 
 
 REFUSED = {
-    "a file": (lambda masks: (masks.rename(masks.with_name("x")), masks.write_text("")), "not a folder of masks"),
+    "a file": (lambda masks: (masks.rename(masks.with_name("x")), masks.write_text("")), "masks cannot be used: empty"),
     "the output": (linked("out"), "cannot be both the masks and the output"),
     "masks of a former run": (linked("out/masks"), "keeps its own files"),
     "none fits": (lambda masks: (masks / "sub").rename(masks / "other"), "none of the 1 files in"),

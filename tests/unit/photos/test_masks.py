@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sfm_app.photos.decode import fill_masked
-from sfm_app.photos.masks import find_mask, lay_out_mask, list_masks, read_mask, unused_masks
-from sfm_app.types import Photo
+from sfm_app.photos.masks import assign_masks, check_mask, lay_out_mask, list_masks, read_mask, unused_masks
+from sfm_app.types import Photo, UnusablePhoto
 
 USED = np.zeros((40, 60), bool)
 USED[5:35, 20:50] = True
@@ -36,6 +36,12 @@ def photo(name="a.jpg", width=60, height=40):
     return Photo(name, width, height, "g")
 
 
+def find_mask(photo, photos, masks):
+    """The photo with its mask, where that is of use."""
+    (assigned,) = assign_masks([photo], list_masks(str(masks), photos, photos / "out"))
+    return check_mask(assigned, photos, masks)
+
+
 def laid_out(found, photos, masks, tmp_path):
     lay_out_mask(found, photos, masks, tmp_path / "laid out")
     return read_mask(tmp_path / "laid out", found.name)
@@ -46,11 +52,15 @@ def laid_out(found, photos, masks, tmp_path):
     [
         ("sub/a.jpg", ("sub/a.jpg.png", "sub/a.png"), "sub/a.jpg.png"),
         ("sub/a.jpg", ("sub/a.png",), "sub/a.png"),
-        ("sub/a.jpg", ("a.jpg.png", "a.png", "sub/a.jpg", "sub/a.jpg.jpg"), ""),
+        ("sub/a.jpg", ("a.jpg.png", "a.png", "sub/ab.jpg"), ""),
+        ("sub/a.jpg", ("sub/a.jpg", "sub/a.jpg.jpg"), "sub/a.jpg.jpg"),
+        ("sub/a.jpg", ("sub/a_mask.png", "sub/b_mask.png"), "sub/a_mask.png"),
+        ("sub/a.jpg", ("sub/a.JPG.png", "sub/a.mask.jpeg"), "sub/a.mask.jpeg"),
+        ("a.png", ("mask_a.tif", "mask_b.tif"), "mask_a.tif"),
         ("a.png", ("a.png.png",), "a.png.png"),
         ("a.png", ("a.png",), "a.png"),
         ("a", ("a.png",), "a.png"),
-        ("a.b.jpg", ("a.png",), ""),
+        ("a.b.jpg", ("a.png", "b.png"), ""),
         ("a.b.jpg", ("a.b.png",), "a.b.png"),
     ],
 )
@@ -59,7 +69,7 @@ def test_masks_are_named_as_colmap_names_them(photos, masks, name, there, expect
         Image.fromarray(GRAY).save(masks / mask, "PNG")
     found = find_mask(photo(name), photos, masks)
     assert found == replace(photo(name), mask=expected)
-    assert unused_masks(list_masks(masks, photos, photos / "out"), [found]) == sorted(set(there) - {expected})
+    assert unused_masks(list_masks(str(masks), photos, photos / "out"), [found]) == sorted(set(there) - {expected})
 
 
 def palette():
@@ -93,6 +103,38 @@ def test_black_and_transparent_is_masked_and_all_else_is_used(photos, masks, tmp
     np.testing.assert_array_equal(laid_out(found, photos, masks, tmp_path), USED)
     with Image.open(tmp_path / "laid out" / "a.jpg.png") as image:
         assert (image.mode, sorted(set(image.tobytes()))) == ("L", [0, 255])
+
+
+@pytest.mark.parametrize(
+    "mask", [np.where(USED, 255, 3), np.where(USED, 250, 20), np.where(USED, 65535, 900), np.where(USED, 2, 0)]
+)
+def test_what_is_nearly_black_is_masked(photos, masks, tmp_path, mask):
+    Image.fromarray(mask.astype(np.uint16 if mask.max() > 255 else np.uint8)).save(masks / "a.png")
+    np.testing.assert_array_equal(laid_out(find_mask(photo(), photos, masks), photos, masks, tmp_path), USED)
+
+
+@pytest.mark.parametrize("quality", [50, 75, 95])
+def test_masks_may_be_jpegs(photos, masks, tmp_path, quality):
+    Image.fromarray(GRAY).convert("RGB").save(masks / "a_mask.jpg", quality=quality)
+    seen = laid_out(find_mask(photo(), photos, masks), photos, masks, tmp_path)
+    assert (seen != USED).mean() < 0.01
+    Image.fromarray(GRAY // 40).save(masks / "a_mask.jpg", quality=quality)
+    assert find_mask(photo(), photos, masks) == UnusablePhoto("a.jpg", "its mask is all black")
+
+
+def test_a_single_mask_of_no_photo_is_that_of_all(photos, masks):
+    several = [photo("a.jpg"), photo("sub/b.jpg")]
+    assert [one.mask for one in assign_masks(several, ["hood.png", ".DS_Store"])] == ["hood.png"] * 2
+    assert [one.mask for one in assign_masks(several, ["a.png"])] == ["a.png", ""]
+    assert [one.mask for one in assign_masks(several, ["a.png"], for_all=True)] == ["a.png"] * 2
+    assert [one.mask for one in assign_masks(several, ["hood.png", "tripod.png"])] == ["", ""]
+
+
+def test_a_mask_tells_whether_it_hides_anything(photos, masks, tmp_path):
+    for name, gray in (("a.png", GRAY), ("b.png", GRAY | 255)):
+        Image.fromarray(gray).save(masks / name)
+        found = find_mask(photo(name), photos, masks)
+        assert lay_out_mask(found, photos, masks, tmp_path / "laid out") == (name == "a.png")
 
 
 def test_without_a_mask_all_is_used_and_masks_go_by_the_name_of_the_photo_in_the_run(photos, masks, tmp_path):
@@ -139,7 +181,7 @@ def test_photos_and_output_inside_the_folder_of_masks_are_no_masks(tmp_path):
     for name in ("photos/a.jpg", "out/masks/a.jpg.png", "a.jpg.png", ".DS_Store"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"x")
-    names = list_masks(tmp_path, tmp_path / "photos", tmp_path / "out")
+    names = list_masks(str(tmp_path), tmp_path / "photos", tmp_path / "out")
     assert names == [".DS_Store", "a.jpg.png"]
     assert unused_masks(names, [photo()]) == ["a.jpg.png"]
 

@@ -5,6 +5,7 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
+from sfm_app.errors import InputError
 from sfm_app.photos.masks import read_mask
 from sfm_app.photos.probe import read_photo
 from sfm_app.photos.source import read_source
@@ -255,3 +256,33 @@ def test_a_mask_and_transparent_pixels_both_hold(folder, run, tmp_path):
 def test_a_photo_that_is_transparent_all_over_is_left_out(folder, run):
     Image.new("RGBA", (128, 96), (9, 9, 9, 0)).save(folder / "c.png")
     assert {one.name: one.reason for one in make(folder, run).unusable} == {"c.png": "transparent all over"}
+
+
+def with_masks(run, place):
+    return replace(run, settings=Settings.from_mapping({"photos": {"masks": str(place)}}))
+
+
+@pytest.mark.parametrize("place", ["mask.png", "photos/mask.png", "a.png"])
+def test_one_file_masks_all_photos(folder, run, tmp_path, place):
+    upper = np.zeros((96, 128), np.uint8)
+    upper[:50] = 255
+    Image.fromarray(upper).save(tmp_path / place)
+    found = make(folder, run := with_masks(run, tmp_path / place))
+    assert [photo.name for photo in found.photos] == ["a.jpg", "b.png"]
+    for photo in found.photos:
+        assert np.array_equal(laid_mask(run, photo.name), upper > 0)
+    assert run.statistics["masks"] == {"photos": 2, "unused": []}
+    assert load(folder, run).photos == found.photos
+
+
+def test_masks_that_hide_nothing_are_named_and_black_ones_give_one_reason(folder, run, tmp_path):
+    (tmp_path / "masks").mkdir()
+    for name, level in (("a.png", 255), ("b.png", 255)):
+        Image.new("L", (128, 96), level).save(tmp_path / "masks" / name)
+    run = with_masks(run, tmp_path / "masks")
+    make(folder, run)
+    assert run.statistics["masks"] == {"photos": 2, "unused": [], "white": ["a.jpg", "b.png"]}
+    for name in ("a.png", "b.png"):
+        Image.new("L", (128, 96)).save(tmp_path / "masks" / name)
+    with pytest.raises(InputError, match=r"^no usable photo in .*: 2 its mask is all black$"):
+        make(folder, run)
