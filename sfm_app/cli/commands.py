@@ -15,6 +15,7 @@ from click.shell_completion import get_completion_class
 
 import sfm_app
 from sfm_app.cli.options import (
+    PATH,
     complete_methods,
     json_option,
     output_options,
@@ -35,7 +36,6 @@ SCENES = {
     "fisheye": "the court again, 12 photos through a fisheye of 180 degrees",
 }
 """Scenes of the demo by name; importing `sfm_app.demo` takes seconds."""
-PATH = click.Path(path_type=Path)
 STAGES = tuple(STAGE_TITLES)
 MARKER_FAMILIES = tuple(name for name in get_args(setting_field("scale.marker_family").annotation) if name != "auto")
 PAPERS = ("a4", "a3", "letter")

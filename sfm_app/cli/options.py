@@ -1,5 +1,6 @@
 """Options that several commands share; type, help, range and default of a setting's flag come from its field."""
 
+import os
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -43,6 +44,18 @@ class SettingFlag:
         return {table: {key: value}} if table else {key: value}
 
 
+class GivenPath(click.Path):
+    """Path of the command line. An empty one, from a variable without a value, would mean the current folder."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path; a usage error refuses an empty one."""
+        if not os.fspath(value):
+            self.fail("it is empty: name a path, or leave the option out", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+PATH = GivenPath(path_type=Path)
+
 SETTING_FLAGS = (
     SettingFlag("--seed", "seed"),
     SettingFlag("--workers", "workers"),
@@ -74,9 +87,7 @@ def settings_options(command: Command) -> Command:
     """Add the options that change settings, from --config to -v."""
     plugins = (setting_field("plugins").description or "").partition(";")[0]
     options = (
-        click.option(
-            "--config", type=click.Path(path_type=Path), help="Settings file (TOML); `sfm-app config` prints one."
-        ),
+        click.option("--config", type=PATH, help="Settings file (TOML); `sfm-app config` prints one."),
         *(setting_option(flag) for flag in SETTING_FLAGS),
         click.option("--no-plugins", is_flag=True, help=f"Do not {plugins}."),
         click.option("--set", "assignments", multiple=True, metavar="TABLE.KEY=VALUE", help="Any other setting."),
@@ -112,6 +123,8 @@ def setting_option(flag: SettingFlag) -> Callable[[Command], Command]:
     complete = complete_methods(flag.methods) if flag.methods else None
     if choices := get_args(kind):
         kind = click.Choice(choices)
+    if flag.metavar in ("FILE", "FOLDER"):
+        kind = GivenPath(path_type=str)
     return click.option(flag.flag, type=kind, metavar=flag.metavar, help=text, shell_complete=complete)
 
 

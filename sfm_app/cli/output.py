@@ -44,12 +44,23 @@ STAGE_TITLES: Mapping[str, str] = MappingProxyType({
 
 def print_json(value: Any) -> None:
     """Print one JSON document on stdout."""
-    sys.stdout.write(json_text(value))
+    _write(json_text(value))
 
 
 def print_lines(lines: Iterable[str]) -> None:
     """Print lines on stdout without folding; escape unprintable characters."""
-    sys.stdout.write("".join(f"{to_printable(line)}\n" for line in lines))
+    _write("".join(f"{to_printable(line)}\n" for line in lines))
+
+
+def _write(text: str) -> None:
+    """Write to stdout, or to nowhere from the moment that no program reads it any more, as after `| head`."""
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
 
 
 def print_text(lines: Iterable[str]) -> None:

@@ -86,6 +86,7 @@ class Program(click.Group):
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
         """Run the command line; end the process at once where a call of COLMAP still runs."""
+        replace_missing_streams()
         if isinstance(sys.stdout, TextIOWrapper):  # on Windows, a file may lack the letters of other languages
             sys.stdout.reconfigure(errors="backslashreplace")
         try:
@@ -130,6 +131,13 @@ class Program(click.Group):
             fail(*describe_os_error(err), 3)
         except Exception as err:  # a bug: the user gets one line, log.txt has the traceback
             fail(f"unexpected {type(err).__name__}: {err}", "this is a bug; please report it with OUT/log.txt", 1)
+
+
+def replace_missing_streams() -> None:
+    """Open streams to nowhere for those that the process lacks, as services do; files would take their numbers."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115 - open to the end
 
 
 def describe_os_error(err: OSError) -> tuple[str, str]:

@@ -81,13 +81,13 @@ NAMED_BYTES = 1_000_000
 def list_photos(folder: Path, out: Path, listed_in: Path | None = None, closed: Sequence[Path] = ()) -> dict[str, str]:
     """Return the names that `list_files` does, each with the reason why it is no photo; most reasons are empty.
 
-    `listed_in` is a text file with the names to return instead, one per line, relative to the folder. An InputError
-    says that the folder does not exist or cannot be read.
+    `listed_in` is a text file with the names to return instead, one per line. An InputError says that the folder does
+    not exist or cannot be read.
     """
     if not folder.is_dir():
         raise _bad_path_error(folder)
     if listed_in is not None:
-        return dict.fromkeys(_read_list(listed_in), "")
+        return dict.fromkeys(_read_list(listed_in, folder), "")
     made = _find_made(folder, {place.resolve() for place in (out, *closed)})
     names = list_files(folder, out, (*closed, *(folder / name for name in made)))
     derived = _derived_from(folder, names) | _textures(folder, names) | _raw_twins(names)
@@ -246,13 +246,34 @@ def resolve_file(folder: Path, name: str) -> Path | str:
     return real if real.is_file() else "not a file"  # reading a pipe would never end
 
 
-def _read_list(file: Path) -> list[str]:
+def _read_list(file: Path, folder: Path) -> list[str]:
+    """Return the names in a list, as seen from the folder; lines that begin with # and name no file are comments."""
     try:
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
+        data = file.read_bytes()
+        text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except (OSError, ValueError) as err:
         reason = err.strerror if isinstance(err, OSError) else "not a UTF-8 text"
         raise InputError(f"cannot read {file}: {reason}", hint="one photo per line, as seen from the folder") from err
-    return sorted({Path(line).as_posix() for line in lines if line.strip()})
+    names = {_name_in(folder, line, file.parent) for line in text.splitlines() if line.strip()}
+    return sorted(name for name in names if name and not (name.startswith("#") and not os.path.lexists(folder / name)))
+
+
+def _name_in(folder: Path, line: str, beside: Path) -> str:
+    """Return the name of a listed file as seen from the folder; the line itself where no file is meant.
+
+    Lists name files as seen from the folder, from the current folder, from their own, or in full.
+    """
+    try:
+        root = folder.resolve()
+        for text in dict.fromkeys((line, line.strip())):
+            for place in (folder / text, Path(text), beside / text):
+                if os.path.lexists(place):
+                    path = place.parent.resolve() / place.name
+                    if path.is_relative_to(root) and path != root:
+                        return path.relative_to(root).as_posix()
+    except (OSError, ValueError, RuntimeError):  # a line may be no name, or a cycle of links
+        pass
+    return Path(line).as_posix()
 
 
 def _walk(folder: Path, excluded: set[Path]) -> Iterator[Path]:

@@ -276,6 +276,8 @@ def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoS
 
 def _too_few_message(folder: Path, usable: int, unusable: list[UnusablePhoto]) -> str:
     reasons = Counter("copies of another" if "same picture" in photo.reason else photo.reason for photo in unusable)
+    missing = [photo.name for photo in unusable if photo.reason == "missing"]  # from a list
     counts = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
+    counts += f", such as {missing[0]}" if missing else ""
     number = "no usable photo" if usable == 0 else "only one usable photo"
     return f"{number} in {folder}: " + (counts or ("the folder is empty" if usable == 0 else "it has no other file"))

@@ -259,3 +259,32 @@ def test_a_warning_of_python_reaches_no_terminal():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "sfm-app run PHOTOS" in done.stdout and done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("run", ""), ("run", "HERE", "-o", ""), ("run", "HERE", "--images", ""), ("run", "HERE", "--masks", ""),
+     ("calibrate", ""), ("export", "", "ply"), ("view", ""), ("report", ""), ("measure", "", "1,2,3", "4,5,6"),
+     ("config", "--config", "")],
+)  # fmt: skip
+def test_empty_paths_are_refused_before_any_work(tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    result = call(*(str(tmp_path) if word == "HERE" else word for word in words))
+    assert result.exit_code == 2 and "it is empty: name a path" in " ".join(result.stderr.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def run_in_shell(script):
+    return subprocess.run(
+        ["sh", "-c", script.replace("APP", f"{sys.executable} -m sfm_app")], capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such shell")
+@pytest.mark.parametrize("words", ["config", "plugins", "--help", "doctor"])
+def test_nobody_needs_to_read_the_output(words):
+    done = run_in_shell(f"exec 3>&1 >&- 2>&-; APP {words}; echo $? >&3")
+    assert done.stdout in ("0\n", "1\n" if words == "doctor" else "0\n")  # the doctor may find faults
+    done = run_in_shell(f"(APP {words}; echo rc=$? >&2) | true")
+    assert re.fullmatch(r"rc=[01]\n", done.stderr), done.stderr

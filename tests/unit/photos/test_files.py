@@ -42,6 +42,17 @@ def test_a_list_names_the_photos(folder, out, tmp_path):
     assert found["../secret.jpg"] == found["/etc/passwd"] == "outside the folder"
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_lists_name_photos_from_any_folder(folder, out, tmp_path, monkeypatch, encoding):
+    monkeypatch.chdir(tmp_path)
+    (folder / "#1.jpg").write_bytes(b"x")
+    (folder / " c.jpg").write_bytes(b"x")
+    lines = ["# mine", "#1.jpg", f"{folder}/a.jpg", "photos/b.jpg", "inner/../inner/a.jpg  ", " c.jpg", "d.jpg"]
+    (folder / "list.txt").write_text("\n".join(lines), encoding)
+    found = list_photos(folder, out, folder / "list.txt")
+    assert list(found) == [" c.jpg", "#1.jpg", "a.jpg", "b.jpg", "d.jpg", "inner/a.jpg"]
+
+
 def fill(folder, *names, size=(60, 40), mode="RGB"):
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

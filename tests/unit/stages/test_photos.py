@@ -286,3 +286,10 @@ def test_masks_that_hide_nothing_are_named_and_black_ones_give_one_reason(folder
         Image.new("L", (128, 96)).save(tmp_path / "masks" / name)
     with pytest.raises(InputError, match=r"^no usable photo in .*: 2 its mask is all black$"):
         make(folder, run)
+
+
+def test_names_of_a_list_that_are_not_there_are_named(folder, run, tmp_path):
+    (tmp_path / "list.txt").write_text("no.jpg\nnone.jpg\n")
+    run = replace(run, settings=Settings.from_mapping({"photos": {"images": str(tmp_path / "list.txt")}}))
+    with pytest.raises(InputError, match=r"^no usable photo in .*: 2 missing, such as no.jpg$"):
+        make(folder, run)
