@@ -322,10 +322,12 @@ def _find_picture(path: Path) -> tuple[Path | BytesIO | None, int]:
     """
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
-        if any(head.startswith(start) for start in RAW_HEADS) or head[4:12] == b"ftypcrx " or head[8:10] == b"CR":
+        if head.startswith(RAW_HEADS) or head[4:12] == b"ftypcrx ":
             return None, 1
         if head[:4] not in TIFF_HEADS:
             return path, 0
+        if head[8:10] == b"CR":  # Canon
+            return None, 1
         start, length = (8, 8) if head[2:4] in (b"+\0", b"\0+") else (4, 4)  # BigTIFF has long addresses
         pictures = _list_tiff(file, head[: start + length])
         if any(tags.get(PHOTOMETRIC_INTERPRETATION) in RAW_COLORS for tags in pictures.values()):
