@@ -47,7 +47,7 @@ def test_distortion_widens_the_field():
 
 def test_a_guess_says_what_it_is_and_why():
     texts = camera_texts(camera(identifiable=False, method="exif", reason="an orbit"))
-    assert "these photos do not determine it (an orbit): from EXIF" in texts
+    assert "these photos do not determine it (an orbit): a claim" in texts
 
 
 def test_lens_and_assumptions_are_empty_without_content():
