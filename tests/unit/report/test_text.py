@@ -46,7 +46,7 @@ def test_distortion_widens_the_field():
 
 
 def test_a_guess_says_what_it_is_and_why():
-    texts = camera_texts(camera(identifiable=False, method="exif", reason="an orbit"))
+    texts = camera_texts(camera(identifiable=False, method="claim", reason="an orbit"))
     assert "these photos do not determine it (an orbit): a claim" in texts
 
 
