@@ -286,6 +286,25 @@ def check_replaceable(target: Path) -> None:
         raise InputError(f"{target} holds files that no export has written, such as {foreign[0]}", hint=ELSEWHERE)
 
 
+def check_parts(main: Path, parts: Sequence[str]) -> None:
+    """Check that the other files of a model are missing, or parts of an earlier export to `main`; InputError if not.
+
+    The user has only named the main file. An earlier one names its parts at its beginning.
+    """
+    present = [path for name in parts if (path := main.with_name(name)).exists()]
+    named = b"".join(_beginning(path) for path in (main, *present) if path.is_file())
+    foreign = [path.name for path in present if path.name.encode() not in named]
+    if foreign:
+        raise InputError(
+            f"{foreign[0]} beside {main} is no part of an earlier export, and would be lost", hint=ELSEWHERE
+        )
+
+
+def _beginning(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(100_000)
+
+
 def _list_files(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
 
