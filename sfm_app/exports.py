@@ -39,6 +39,7 @@ from sfm_app.numerical import json_text
 from sfm_app.operating_system import is_link
 from sfm_app.photos.masks import mask_path, save_mask
 from sfm_app.pipeline import MESH, SCALE, SCENE, TEXTURE
+from sfm_app.products import read_photo_list
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Model, Scene, SceneArrays
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
@@ -167,12 +168,14 @@ class StoredScene:
         return views
 
     def record_entries(self, file_format: str) -> dict[str, object]:
-        """Return the entries of a folder's record."""
+        """Return the entries of a folder's record; photos have the user's paths."""
+        place = self._run.workspace
+        paths = {photo.name: photo.path for photo in read_photo_list(place).photos} if place.photo_set.exists() else {}
         return {
             "made_by": "sfm_app",
             "format": file_format,
-            "photo_of": self.images,
-            "unregistered": dict(self.scene.unregistered),
+            "photo_of": {image: paths.get(photo, photo) for image, photo in self.images.items()},
+            "unregistered": {paths.get(photo, photo): why for photo, why in self.scene.unregistered.items()},
         }
 
     def say(self, text: str) -> None:

@@ -15,6 +15,8 @@ from sfm_app.camera_files import read_given_cameras
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.formats.gltf import FLIP
 from sfm_app.geometry.poses import Similarity
+from sfm_app.products import write_photo_list
+from sfm_app.types import Photo, PhotoSet
 from tests.unit.colored_photos import colors_of
 
 EXACT_PX, RELATIVE = 1e-6, 1e-6
@@ -267,6 +269,17 @@ def test_bundler_sees_points_where_the_photos_do(make_run, frame, kinds):
             assert k1 == k2 == 0.0 and at[2] < 0
             errors.append(np.abs(-f * at[:2] / at[2] - x).max())
     assert len(errors) >= 200 and max(errors) < 1e-3
+
+
+@pytest.mark.slow
+def test_the_record_names_the_files_of_the_user(make_run):
+    run = make_run("lens", until="scene")
+    names = [*(image.name for image in run.model.images.values()), "lost.jpg"]
+    photos = tuple(Photo(name, 60, 40, "g", original=f"my {name}.heic") for name in names)
+    write_photo_list(PhotoSet(run.place.photos, photos), dict.fromkeys(names), run.place)
+    record = json.loads((sfm_app.export_scene(run.out, "colmap") / "export.json").read_text("utf-8"))
+    assert set(record["photo_of"].values()) == {photo.path for photo in photos[:-1]}
+    assert record["unregistered"] == {"my lost.jpg.heic": "no overlap"}
 
 
 @pytest.mark.slow
