@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
+from urllib.parse import unquote_to_bytes
 
 import numpy as np
 from numpy.typing import NDArray
@@ -292,10 +293,10 @@ def check_replaceable(target: Path) -> None:
 def check_parts(main: Path, parts: Sequence[str]) -> None:
     """Check that the other files of a model are missing, or parts of an earlier export to `main`; InputError if not.
 
-    The user has only named the main file. An earlier one names its parts at its beginning.
+    The user has only named the main file. An earlier one names its parts.
     """
     present = [path for name in parts if (path := main.with_name(name)).exists()]
-    named = b"".join(_beginning(path) for path in (main, *present) if path.is_file())
+    named = unquote_to_bytes(b"".join(_beginning(path) for path in (main, *present) if path.is_file()))
     foreign = [path.name for path in present if path.name.encode() not in named]
     if foreign:
         raise InputError(
@@ -305,7 +306,7 @@ def check_parts(main: Path, parts: Sequence[str]) -> None:
 
 def _beginning(path: Path) -> bytes:
     with path.open("rb") as file:
-        return file.read(100_000)
+        return file.read(10_000_000)
 
 
 def _list_files(folder: Path) -> list[str]:

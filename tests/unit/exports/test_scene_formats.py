@@ -218,7 +218,8 @@ def test_the_dense_cloud_is_read_from_ply_and_from_laz(make_run, frame):
     points = frame(np.stack([run.cloud[c] for c in "xyz"], axis=1).astype(np.float64))
 
     plain = trimesh.load(sfm_app.export_scene(run.out, "cloud-ply"))
-    laz = laspy.read(sfm_app.export_scene(run.out, "laz"))
+    laz, las = (laspy.read(sfm_app.export_scene(run.out, name)) for name in ("laz", "las"))
+    assert las.header.are_points_compressed is False and np.array_equal(las.xyz, laz.xyz)
 
     np.testing.assert_allclose(plain.vertices, points, rtol=RELATIVE, atol=1e-6 * frame.scale)
     colors = np.stack([run.cloud[c] for c in ("red", "green", "blue")], axis=1)

@@ -229,10 +229,11 @@ def test_files_of_the_user_beside_the_model_are_kept(finished, tmp_path, name):
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == [name]
 
 
-def test_a_model_is_exported_to_the_same_place_again(finished, tmp_path):
-    first = sfm_app.export_model(finished, "obj", tmp_path / "chair.obj")
+@pytest.mark.parametrize("target", ["my chair.obj", "st\u00fchle v1.gltf"])
+def test_a_model_is_exported_to_the_same_place_again(finished, tmp_path, target):
+    first = sfm_app.export_model(finished, target=tmp_path / target)
     before = [path.read_bytes() for path in first]
-    assert len(first) > 2 and sfm_app.export_model(finished, "obj", tmp_path / "chair.obj") == first
+    assert len(first) > 1 and sfm_app.export_model(finished, target=tmp_path / target) == first
     assert [path.read_bytes() for path in first] == before
 
 
