@@ -34,6 +34,9 @@ _MODELS = (
 )
 _SCENES = (
     SceneExporter("colmap", write_colmap, "folder images/, sparse/0: undistorted photos, COLMAP's binary model"),
+    SceneExporter(
+        "openmvs", partial(write_colmap, place="sparse"), "the same with the model in sparse/; OpenMVS, trainers"
+    ),
     SceneExporter("colmap-text", partial(write_colmap, text=True), "the same with COLMAP's model as text"),
     SceneExporter(
         "splat",

@@ -46,16 +46,17 @@ def check_picture(path, K, R, frame, used=None):
     assert np.mean(wrong) < 2.5 and np.quantile(wrong, 0.99) < 12
 
 
-@pytest.mark.parametrize("name", ["colmap", pytest.param("colmap-text", marks=pytest.mark.slow), "splat"])
+@pytest.mark.parametrize("name", ["colmap", pytest.param("colmap-text", marks=pytest.mark.slow), "splat", "openmvs"])
 @pytest.mark.parametrize("kinds", [("lens", "other"), ("pinhole",), ("fisheye",), ("panorama", "lens")], ids="+".join)
 def test_colmap_reads_photos_without_distortion(make_run, frame, name, kinds):
     run = make_run(*kinds, until="scene")
 
     folder = sfm_app.export_scene(run.out, name)
-    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    place = folder / ("sparse" if name == "openmvs" else "sparse/0")
+    model = pycolmap.Reconstruction(place)
 
     assert folder == run.out / "export" / name
-    assert (folder / "sparse/0" / f"images.{'txt' if name == 'colmap-text' else 'bin'}").exists()
+    assert (place / f"images.{'txt' if name == 'colmap-text' else 'bin'}").exists()
     truth = places(run.model, frame)
     shares = len(model.points3D) / len(truth)
     assert 0.9 < shares <= 1.0 and (shares == 1.0 or name == "splat" or "lens" in kinds)
