@@ -317,21 +317,21 @@ def nerfstudio_cameras(values: Mapping[str, Any]) -> Cameras:
 
 
 def _nerfstudio_camera(values: Mapping[str, Any]) -> Calibration:
-    width, height = (float(values[name] or 0.0) for name in ("w", "h"))
-    fx = float(values["fl_x"] or 0.0)
-    if not fx and values["camera_angle_x"]:
-        fx = 0.5 * width / math.tan(0.5 * float(values["camera_angle_x"]))
-    if not (fx and width and height):
-        raise ValueError("it has no focal length, or no width and height in pixels")
-    center = (float(width / 2 if values["cx"] is None else values["cx"]),
-              float(height / 2 if values["cy"] is None else values["cy"]))  # fmt: skip
-    k1, k2, p1, p2, k3, k4, *_ = (float(values[name] or 0.0) for name in TERMS)
     fisheye = "FISHEYE" in str(values["camera_model"])
-    if k4 and not fisheye:
+    number = {key: float(value) for key, value in values.items() if value is not None and key != "camera_model"}
+    width, height = number.get("w", 0.0), number.get("h", 0.0)
+    fx = number.get("fl_x", 0.0)
+    if not fx and "camera_angle_x" in number:
+        fx = 0.5 * width / math.tan(0.5 * number["camera_angle_x"])
+    if min(fx, width, height) <= 0.0:
+        raise ValueError("it has no focal length, or no width and height in pixels")
+    if number.get("k4") and not fisheye:
         raise ValueError("its term k4 is not supported")
-    model, terms = ("OPENCV_FISHEYE", [k1, k2, k3, k4]) if fisheye else ("FULL_OPENCV", [k1, k2, p1, p2, k3, 0, 0, 0])
-    params = [fx, float(values["fl_y"] or fx), *center, *terms]
-    return calibration_from_model(model, params, (int(width), int(height)))
+    names = TERMS[:2] + TERMS[4:6] if fisheye else TERMS[:5]
+    terms = [number.get(name, 0.0) for name in names] + ([] if fisheye else [0.0] * 3)
+    center = number.get("cx", 0.5 * width), number.get("cy", 0.5 * height)
+    params = [fx, number.get("fl_y", fx), *center, *terms]
+    return calibration_from_model("OPENCV_FISHEYE" if fisheye else "FULL_OPENCV", params, (int(width), int(height)))
 
 
 # Cameras of Metashape's XML, a project's or one camera's. The center counts from the middle of the photo, and p1 and p2
