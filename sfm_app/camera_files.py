@@ -321,7 +321,7 @@ def _nerfstudio_camera(values: Mapping[str, Any]) -> Calibration:
     number = {key: float(value) for key, value in values.items() if value is not None and key != "camera_model"}
     width, height = number.get("w", 0.0), number.get("h", 0.0)
     fx = number.get("fl_x", 0.0)
-    if not fx and "camera_angle_x" in number:
+    if not fx and number.get("camera_angle_x"):
         fx = 0.5 * width / math.tan(0.5 * number["camera_angle_x"])
     if min(fx, width, height) <= 0.0:
         raise ValueError("it has no focal length, or no width and height in pixels")

@@ -10,7 +10,7 @@ from PIL.ExifTags import IFD
 from PIL.TiffImagePlugin import IFDRational
 
 from sfm_app.operating_system import Ability, find_in_wheel
-from sfm_app.photos.decode import FORMATS, UnreadableError, _install_handler, focal_px, read_picture, upright_image
+from sfm_app.photos.decode import FORMATS, UnreadableError, _install_handler, exif_prior, read_picture, upright_image
 
 LIBTIFF = list(find_in_wheel(Path(PIL.__file__).parent, "pillow", "libtiff"))
 
@@ -145,7 +145,8 @@ TAGS = {"MM": 0x920A, "EQUIVALENT": 0xA405, "WIDTH": 0xA002, "HEIGHT": 0xA003, "
 def claimed(longer_side, **tags):
     exif = Image.Exif()
     exif.get_ifd(IFD.Exif).update({TAGS[name]: value for name, value in tags.items()})
-    return focal_px(exif, longer_side)
+    prior = exif_prior(exif, longer_side)
+    return prior and prior.focal_px
 
 
 SENSOR = {"MM": 20.0, "WIDTH": 6000, "HEIGHT": 4000, "RESOLUTION": IFDRational(6000, 24), "UNIT": 4}
