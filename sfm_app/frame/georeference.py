@@ -80,7 +80,9 @@ def georeference(
     rms_m = fit.rms_m if isinstance(fit, Georeference) else np.inf
     if isinstance(other, Georeference) and OPTIONS.min_swap_gain * other.rms_m < min(rms_m, _width(swapped)):
         now = f"they miss by {rms_m:.2g} m" if fit else "they do not agree"
-        return Rejected(f"latitude and longitude are probably swapped: {now}, and swapped by {other.rms_m:.2g} m")
+        return Rejected(
+            f"latitude and longitude are probably swapped: {now}, and swapped by {other.rms_m:.2g} m; correct the EXIF"
+        )
     return fit
 
 
