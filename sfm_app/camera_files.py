@@ -8,6 +8,7 @@ import json
 import math
 import re
 import struct
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from sfm_app.camera.models import PARAMETERS, calibration_from_model
 from sfm_app.errors import InputError
-from sfm_app.files import fingerprint
+from sfm_app.files import decode_text, fingerprint, read_bytes, read_text
 from sfm_app.numerical import finite_entries
 from sfm_app.types import Calibration, GivenCameras
 from sfm_app.types.camera import GIVEN, PROJECTIONS
@@ -82,8 +83,8 @@ def read_colmap_folder(folder: Path) -> tuple[dict[str, Calibration], dict[str, 
         known = dict(_binary_images(images.read_bytes())) if images.is_file() else {}
         return read_colmap_binary((folder / "cameras.bin").read_bytes()), known
     images = folder / "images.txt"
-    known = dict(_text_images(images.read_text(encoding="utf-8"))) if images.is_file() else {}
-    return read_colmap_text((folder / "cameras.txt").read_text(encoding="utf-8")), known
+    known = dict(_text_images(read_text(images, 100 * MOST_BYTES))) if images.is_file() else {}
+    return read_colmap_text(read_text(folder / "cameras.txt", MOST_BYTES)), known
 
 
 def _text_images(text: str) -> Iterator[tuple[str, str]]:
@@ -437,16 +438,10 @@ def _read_folder(folder: Path) -> tuple[str, Cameras]:
 
 
 def _read_file(path: Path) -> tuple[str, Cameras]:
-    with path.open("rb") as file:
-        data = file.read(MOST_BYTES + 1)
-    if len(data) > MOST_BYTES:
-        raise ValueError(f"it is larger than {MOST_BYTES // 1_000_000} MB")
-    if b"\0" in data:
+    data = read_bytes(path, MOST_BYTES)
+    if b"\0" in data and not data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
         return "COLMAP", (read_colmap_binary(data), {})
-    try:
-        text = data.decode("utf-8-sig").strip()
-    except UnicodeDecodeError:
-        raise ValueError("it is neither text nor COLMAP's cameras.bin") from None
+    text = decode_text(data).strip()
     if text.startswith("<"):
         root = read_xml(text)
         if root.tag in ("document", "calibration"):

@@ -6,6 +6,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from sfm_app.errors import InputError
+from sfm_app.files import read_text
 from sfm_app.operating_system import is_link
 
 EXTENSIONS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts", ".3gp")
@@ -49,6 +50,8 @@ def _has_packets(head: bytes, first: int, length: int) -> bool:
     return len(head) == HEAD_BYTES and all(head[k] == 0x47 for k in range(first, HEAD_BYTES, length))
 
 
+MOST_LIST_BYTES = 100_000_000
+"""Largest list of photos: a million names."""
 HINT = "name the folder that holds the photos"
 
 
@@ -111,9 +114,9 @@ def resolve_file(folder: Path, name: str) -> Path | str:
 
 def _read_list(file: Path) -> list[str]:
     try:
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_text(file, MOST_LIST_BYTES).splitlines()
     except (OSError, ValueError) as err:
-        reason = err.strerror if isinstance(err, OSError) else "not a UTF-8 text"
+        reason = err.strerror if isinstance(err, OSError) else str(err)
         raise InputError(f"cannot read {file}: {reason}", hint="one photo per line, as seen from the folder") from err
     return sorted({Path(line).as_posix() for line in lines if line.strip()})
 

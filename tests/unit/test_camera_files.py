@@ -384,7 +384,7 @@ def test_bytes_of_any_kind_end_in_cameras_or_in_one_error(tmp_path_factory, data
         ("%YAML:1.0\n---\n{[", "no valid YAML"),
         (b"\0\0\0\0", "not those of a COLMAP model"),
         (struct.pack("<QIiQQ", 1, 1, 7, 9, 9), "a model that is not supported"),
-        (b"\xff\xfe\x31", "neither text nor"),
+        (b"\xff\xfe\x31", "it is no text in UTF-8 or UTF-16"),
     ],
 )
 def test_what_is_no_calibration_says_why_and_which_forms_are_known(tmp_path, data, says):
@@ -392,6 +392,14 @@ def test_what_is_no_calibration_says_why_and_which_forms_are_known(tmp_path, dat
         given(tmp_path / "cameras", data)
     assert says in str(caught.value)
     assert "cameras.txt" in caught.value.hint and "OpenSfM" in caught.value.hint
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_text_of_powershell_is_read(tmp_path, encoding):
+    text = "1 SIMPLE_PINHOLE 1000 800 900 500 400\n"
+    assert only(tmp_path / "cameras.txt", text.encode(encoding)).K[0, 0] == 900.0
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 ä.jpg\n\n", encoding)
+    assert read_given_cameras(tmp_path).camera_of == {"ä.jpg": "1"}
 
 
 def test_missing_files_and_folders_without_cameras_are_named(tmp_path):
