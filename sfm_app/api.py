@@ -299,7 +299,7 @@ def export_model(
         >>> [path.name for path in files[:2]]
         ['model.obj', 'model.mtl']
     """
-    from sfm_app.exports import stored_model  # loads COLMAP
+    from sfm_app.exports import check_parts, stored_model  # loads COLMAP
 
     plugins = load_plugins()
     place = Path(target) if target is not None else Path(out)
@@ -313,6 +313,7 @@ def export_model(
     files = exporter.write(model, place.stem)
     renamed = dict(zip([place.name, *list(files)[1:]], files.values(), strict=True))
     with _naming_target(place):
+        check_parts(place, list(renamed)[1:])
         return save_files(renamed, place.parent)
 
 

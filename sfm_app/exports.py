@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
+from urllib.parse import unquote_to_bytes
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,7 @@ from sfm_app.numerical import json_text
 from sfm_app.operating_system import is_link
 from sfm_app.photos.masks import mask_path, save_mask
 from sfm_app.pipeline import MESH, SCALE, SCENE, TEXTURE
+from sfm_app.products import read_photo_list
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Model, Scene, SceneArrays
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
@@ -166,12 +168,14 @@ class StoredScene:
         return views
 
     def record_entries(self, file_format: str) -> dict[str, object]:
-        """Return the entries of a folder's record."""
+        """Return the entries of a folder's record; photos have the user's paths."""
+        place = self._run.workspace
+        paths = {photo.name: photo.path for photo in read_photo_list(place).photos} if place.photo_set.exists() else {}
         return {
             "made_by": "sfm_app",
             "format": file_format,
-            "photo_of": self.images,
-            "unregistered": dict(self.scene.unregistered),
+            "photo_of": {image: paths.get(photo, photo) for image, photo in self.images.items()},
+            "unregistered": {paths.get(photo, photo): why for photo, why in self.scene.unregistered.items()},
         }
 
     def say(self, text: str) -> None:
@@ -281,6 +285,25 @@ def check_replaceable(target: Path) -> None:
     foreign = sorted(set(files) - {*recorded_files(target), RECORD})
     if foreign:
         raise InputError(f"{target} holds files that no export has written, such as {foreign[0]}", hint=ELSEWHERE)
+
+
+def check_parts(main: Path, parts: Sequence[str]) -> None:
+    """Check that the other files of a model are missing, or parts of an earlier export to `main`; InputError if not.
+
+    The user has only named the main file. An earlier one names its parts.
+    """
+    present = [path for name in parts if (path := main.with_name(name)).exists()]
+    named = unquote_to_bytes(b"".join(_beginning(path) for path in (main, *present) if path.is_file()))
+    foreign = [path.name for path in present if path.name.encode() not in named]
+    if foreign:
+        raise InputError(
+            f"{foreign[0]} beside {main} is no part of an earlier export, and would be lost", hint=ELSEWHERE
+        )
+
+
+def _beginning(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(10_000_000)
 
 
 def _list_files(folder: Path) -> list[str]:

@@ -5,6 +5,7 @@ import hashlib
 import json
 import secrets
 import shutil
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePath
 from typing import Any
@@ -130,6 +131,28 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
         file.seek(0)
         with np.load(file, allow_pickle=False) as stored:
             return dict(stored)
+
+
+def read_text(path: Path, most_bytes: int) -> str:
+    """Return a text file of the user; errors as in `read_bytes` and `decode_text`."""
+    return decode_text(read_bytes(path, most_bytes))
+
+
+def read_bytes(path: Path, most_bytes: int) -> bytes:
+    """Return a file; raise an OSError if it cannot be read, a ValueError if it is larger."""
+    with path.open("rb") as file:
+        data = file.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        raise ValueError(f"it is larger than {most_bytes / 1e6:g} MB")
+    return data
+
+
+def decode_text(data: bytes) -> str:
+    """Return a text in UTF-8, or in UTF-16 with a byte order mark, as PowerShell writes; ValueError for others."""
+    try:
+        return data.decode("utf-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
+    except UnicodeDecodeError:
+        raise ValueError("it is no text in UTF-8 or UTF-16; save it as UTF-8") from None
 
 
 def digest_file(path: Path) -> str:

@@ -128,7 +128,8 @@ def run_stages(
         place.check_no_overlap(Path(options.masks), "masks")
     if run.settings.calibration.file:
         run = replace(run, given=read_given_cameras(Path(run.settings.calibration.file)))
-    if run.settings.scale.control_points:
-        run = replace(run, control_points=read_control_points(Path(run.settings.scale.control_points)))
     source = read_source(photo_dir, place.root, options, partial(ordered_map, run.executor, ahead=4 * run.workers))
+    if run.settings.scale.control_points:
+        files = [name for name in source.files if name]
+        run = replace(run, control_points=read_control_points(Path(run.settings.scale.control_points), files))
     return PIPELINE.run(source, run, first, last, targets)

@@ -14,6 +14,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from sfm_app.errors import ConfigError
+from sfm_app.files import read_text
 from sfm_app.wording import parse_length, parse_point
 
 CameraModelName = Literal[
@@ -354,16 +355,12 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file; ConfigError where it is not valid."""
     hint = "`sfm-app config` prints a valid one"
     try:
-        with path.open("rb") as file:
-            text = file.read(MOST_TOML_BYTES + 1)
-        if len(text) > MOST_TOML_BYTES:
-            raise ConfigError(f"{path} is no settings file: it is larger than {MOST_TOML_BYTES} bytes", hint=hint)
-        return tomllib.loads(text.decode("utf-8"))
+        return tomllib.loads(read_text(path, MOST_TOML_BYTES))
     except OSError as err:
         raise ConfigError(f"cannot read {path}: {err.strerror}") from err
     except RecursionError:
         raise ConfigError(f"{path} is no settings file: it is nested too deeply", hint=hint) from None
-    except ValueError as err:  # not TOML, not UTF-8, numbers of thousands of digits
+    except ValueError as err:  # not TOML, no text, too large, numbers of thousands of digits
         raise ConfigError(f"{path} is not a TOML file: {err}", hint=hint) from err
 
 

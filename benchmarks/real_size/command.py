@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.common.command_line import new_parser
 from benchmarks.common.processes import module_command, run_command
 from benchmarks.common.results import RESULTS, Row, document, table, write
-from benchmarks.real_size.measured_scene import UTM, add_markers, center_and_aim, write_control_points
+from benchmarks.real_size.measured_scene import GROUND, add_markers, center_and_aim, write_control_points
 from benchmarks.synthetic.scenes import WALKS, build_scene, scene_views
 from sfm_app.colmap.backend import Reconstruction
 from sfm_app.colmap.model import poses_and_points
@@ -131,7 +131,9 @@ def row_of(by: str, scene: str, seed: int, place: Path, views: Views, truth: Sim
         off = []
         for name, center in found_centers(place).items():
             x, y, z = frame(center)
-            east, north, up = np.array([x, -z, y]) + found["offset"] - UTM
+            horizontal, vertical = found["units_per_m"]
+            mapped = np.array([horizontal * x, -horizontal * z, vertical * y]) + found["offset"]
+            east, north, up = GROUND(mapped[None])[0]
             off.append(np.linalg.norm(np.array([east, up, -north]) - camera_center(views.cam_from_world[name])))
         row["center"] = 1000 * float(np.median(off)) / distance
         row["named"] = len(counts["control_points"]["wrong"])

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.synthetic.scenes import marker_sheet
+from sfm_app.frame.coordinates import LocalFrame, read_system
 from sfm_app.frame.markers import draw_pattern
 from sfm_app.synthetic.cameras import Views, camera_center
 from sfm_app.synthetic.shapes import SyntheticScene
@@ -17,6 +18,8 @@ FloatArray = NDArray[np.float64]
 FAMILY = "apriltag-36h11"
 UTM = np.array([500_000.0, 4_649_000.0, 320.0])
 """East, north and up of the scene's origin."""
+GROUND = LocalFrame(read_system("EPSG:32632"), UTM)
+"""Meters east, north and up of it on the ground."""
 MARK_PX = 0.5
 """Standard deviation of a mark in a photo."""
 SURVEY_M = 0.002
@@ -85,7 +88,7 @@ def write_control_points(
         if number in wrong:
             step = rng.normal(size=3)
             at = at + WRONG_M * np.linalg.norm(aim - center) * step / np.linalg.norm(step)
-        east, north, up = UTM + np.array([at[0], -at[2], at[1]])
+        east, north, up = GROUND.positions(np.array([[at[0], -at[2], at[1]]]))[0]
         for name, x in seen.items():
             if np.isfinite(x[vertex]).all():
                 u, v = x[vertex] + MARK_PX * rng.normal(size=2)

@@ -187,15 +187,7 @@ class LensPriors:
         usual[:, [FX, FY]], usual[:, [CX, CY]] = 1.0, sizes / 2.0
         priors = cls(sizes, family, reach, estimated.copy(), (), usual, claims, fixed)
         for row, rule in enumerate(rules):
-            given, claim = rule.usual(int(family[row])), rule.prior
-            if given is not None:
-                usual[row] = given
-            elif claim is not None:
-                usual[row, [FX, FY]], claims[row, LOG_FOCAL] = claim.focal_px, claim.focal_deviation_px / claim.focal_px
-                if claim.center_px is not None:
-                    usual[row, [CX, CY]], claims[row, [CX, CY]] = claim.center_px, claim.center_deviation_px
-                if claim.k1 is not None and family[row] == PERSPECTIVE:
-                    usual[row, K1], claims[row, K1] = claim.k1, claim.k1_deviation
+            rule.write_values(int(family[row]), usual[row], claims[row])
         choices = [priors.consistent_choices(row) for row in range(len(params))]
         for row, rule in enumerate(rules):
             parts, own = rule.parts(int(family[row])), priors.estimated[row]
@@ -337,6 +329,18 @@ class CameraRule:
         if self.given is None or FAMILIES[self.given.projection] != family:
             return None
         return row_of_calibration(self.given)
+
+    def write_values(self, family: int, usual: FloatArray, claims: FloatArray) -> None:
+        """Write the user's or the claimed parameters (12,) over usual ones, and deviations of claims over `claims`."""
+        given, claim = self.usual(family), self.prior
+        if given is not None:
+            usual[:] = given
+        elif claim is not None:
+            usual[[FX, FY]], claims[LOG_FOCAL] = claim.focal_px, claim.focal_deviation_px / claim.focal_px
+            if claim.center_px is not None:
+                usual[[CX, CY]], claims[[CX, CY]] = claim.center_px, claim.center_deviation_px
+            if claim.k1 is not None and family == PERSPECTIVE:
+                usual[K1], claims[K1] = claim.k1, claim.k1_deviation
 
     def parts(self, family: int) -> BoolArray | None:
         """Return (8,) the parts of the model besides focal and center; None if it is open, or not of this family."""

@@ -179,7 +179,7 @@ def camera_rules(
 
 
 def _agreeing_parts(prior: CameraPrior, camera: Calibration | None) -> CameraPrior:
-    """Return a claim without a center or a lens that the pairs have contradicted; the focal may still prove right."""
+    """Return a claim without a center or a lens that the pairs have rejected; the focal may still prove right."""
     if camera is None:
         return prior
     if prior.center_px is not None:

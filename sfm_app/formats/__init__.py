@@ -7,8 +7,8 @@ from functools import partial
 
 from sfm_app.formats.draco import write_draco
 from sfm_app.formats.exporters import CLOUD, Exporter, SceneExporter, missing_package
-from sfm_app.formats.gltf import write_glb
-from sfm_app.formats.meshes import write_cloud_ply, write_laz, write_obj, write_ply, write_stl
+from sfm_app.formats.gltf import write_glb, write_gltf
+from sfm_app.formats.meshes import write_cloud_ply, write_las, write_obj, write_ply, write_stl
 from sfm_app.formats.scenes import write_bundler, write_cameras, write_colmap, write_nerfstudio, write_opencv
 from sfm_app.formats.usd import write_usd, write_usdz
 
@@ -19,6 +19,7 @@ _no_laz = partial(missing_package, "laspy[lazrs]", "lazrs")
 _MODELS = (
     Exporter("ply", write_ply, "ply", "binary PLY, colors and normals per vertex; MeshLab, CloudCompare, Blender"),
     Exporter("glb", write_glb, "glb", "binary glTF 2.0, textured, all in one file; web viewers, game engines, Blender"),
+    Exporter("gltf", write_gltf, "gltf", "the same as JSON, with arrays and pictures in a file beside it"),
     Exporter("obj", write_obj, "obj", "Wavefront OBJ with MTL and JPEG pages, textured; everything else"),
     Exporter(
         "stl",
@@ -33,6 +34,9 @@ _MODELS = (
 )
 _SCENES = (
     SceneExporter("colmap", write_colmap, "folder images/, sparse/0: undistorted photos, COLMAP's binary model"),
+    SceneExporter(
+        "openmvs", partial(write_colmap, place="sparse"), "the same with the model in sparse/; OpenMVS, trainers"
+    ),
     SceneExporter("colmap-text", partial(write_colmap, text=True), "the same with COLMAP's model as text"),
     SceneExporter(
         "splat",
@@ -48,7 +52,8 @@ _SCENES = (
     ),
     SceneExporter("opencv", write_opencv, "folder with a YAML file per camera, with its photos' poses, for OpenCV"),
     SceneExporter("cloud-ply", write_cloud_ply, "the dense cloud as PLY; CloudCompare, MeshLab", "cloud.ply", CLOUD),
-    SceneExporter("laz", write_laz, "the dense cloud as compressed LAS; PDAL, QGIS", "cloud.laz", CLOUD, _no_laz),
+    SceneExporter("las", write_las, "the dense cloud as LAS; PDAL, QGIS", "cloud.las", CLOUD, _no_laz),
+    SceneExporter("laz", partial(write_las, compressed=True), "the same, compressed", "cloud.laz", CLOUD, _no_laz),
 )
 EXPORTERS = {exporter.name: exporter for exporter in _MODELS}
 SCENE_EXPORTERS = {exporter.name: exporter for exporter in _SCENES}

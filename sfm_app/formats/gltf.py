@@ -9,9 +9,11 @@ Unlit materials ignore normal maps, so a model with normal maps is lit: rough, w
 """
 
 import json
+import re
 import struct
 from collections.abc import Mapping
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,10 +73,19 @@ class Glb:
         kind = COMPONENTS[values.dtype]
         return {"bufferView": view, "componentType": kind, "count": len(values), "type": SHAPES[width]}
 
+    def to_text(self, **buffer: str) -> bytes:
+        """Return the tree as JSON; `buffer` are further entries of its only buffer."""
+        tree = {**self.tree, "buffers": [{"byteLength": self._length, **buffer}]}
+        return json.dumps(tree, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
+
+    @property
+    def buffer(self) -> bytes:
+        """The arrays."""
+        return b"".join(self._parts)
+
     def to_bytes(self) -> bytes:
         """Return the whole file."""
-        tree = {**self.tree, "buffers": [{"byteLength": self._length}]}
-        text = json.dumps(tree, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
+        text = self.to_text()
         text += b" " * (-len(text) % 4)
         size = 12 + 8 + len(text) + 8 + self._length
         head = struct.pack("<IIIII", MAGIC, VERSION, size, len(text), JSON_CHUNK)
@@ -95,6 +106,16 @@ def opengl_pose(photo: PosedPhoto) -> NDArray[np.float64]:
 
 def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
     """Write triangles with a texture or a color per vertex, or else points; and the cameras, if any."""
+    return {f"{name}.glb": _build(model, name).to_bytes()}
+
+
+def write_gltf(model: Model, name: str) -> Mapping[str, bytes]:
+    """Write the same as JSON with its arrays and pictures in a file beside it."""
+    glb, arrays = _build(model, name), re.sub(r"\s", "_", f"{name}.bin")
+    return {f"{name}.gltf": glb.to_text(uri=quote(arrays)), arrays: glb.buffer}
+
+
+def _build(model: Model, name: str) -> Glb:
     check_writable(model)
     texture = model.texture if len(model.surface.faces) else None
     is_lit = texture is not None and bool(texture.normal_maps)
@@ -108,7 +129,7 @@ def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
     if model.cameras:
         nodes += add_cameras(glb, model)
     glb.add("scenes", {"name": name, "nodes": nodes})
-    return {f"{name}.glb": glb.to_bytes()}
+    return glb
 
 
 def add_textured_primitives(glb: Glb, model: Model, texture: Texture) -> list[dict[str, Any]]:

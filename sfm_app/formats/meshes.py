@@ -87,8 +87,8 @@ def cloud_ply(cloud: PointCloud) -> bytes:
     return header({"vertex": rows}).encode("ascii") + rows.tobytes()
 
 
-def write_laz(scene: FinishedScene, target: Path) -> None:
-    """Write the dense cloud as compressed LAS with colors, exact to a hundred-millionth of its size; needs laspy."""
+def write_las(scene: FinishedScene, target: Path, *, compressed: bool = False) -> None:
+    """Write the dense cloud as LAS or LAZ with colors, exact to a hundred-millionth of its size; needs laspy."""
     import laspy
 
     cloud = scene.cloud()
@@ -102,7 +102,7 @@ def write_laz(scene: FinishedScene, target: Path) -> None:
     las.x, las.y, las.z = cloud.points.T
     las.red, las.green, las.blue = cloud.colors.T.astype(np.uint16) * 257  # LAS has 16-bit colors
     with target.open("wb") as file:
-        las.write(file, do_compress=True, laz_backend=laspy.LazBackend.Lazrs)
+        las.write(file, do_compress=compressed, laz_backend=laspy.LazBackend.Lazrs)
 
 
 # Wavefront OBJ, with materials (MTL) and texture pages (JPEG) in separate files.

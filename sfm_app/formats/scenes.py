@@ -83,8 +83,10 @@ def write_cameras(scene: FinishedScene, target: Path) -> None:
 MODEL = "sparse/0"
 
 
-def write_colmap(scene: FinishedScene, target: Path, *, text: bool = False, centered: bool = False) -> None:
-    """Write undistorted photos and COLMAP's model, binary or as text, into a folder.
+def write_colmap(
+    scene: FinishedScene, target: Path, *, text: bool = False, centered: bool = False, place: str = MODEL
+) -> None:
+    """Write undistorted photos into a folder, and COLMAP's model, binary or as text, to a `place` in it.
 
     `centered` puts every optical center in the middle of its photo, since some trainers read the focal length only. A
     crop around the optical center would lose much of a cropped photo, so the photo is rotated instead, as if the camera
@@ -92,7 +94,7 @@ def write_colmap(scene: FinishedScene, target: Path, *, text: bool = False, cent
     """
     views = scene.perspective(centered=centered)
     views.write_photos(target)
-    views.write_colmap(target / MODEL, text=text)
+    views.write_colmap(target / place, text=text)
 
 
 def write_bundler(scene: FinishedScene, target: Path) -> None:

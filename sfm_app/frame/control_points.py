@@ -1,23 +1,27 @@
 """Ground control points: their file, and the fit of the model to them."""
 
+import contextlib
 import math
+import mimetypes
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from math import comb
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.errors import InputError
-from sfm_app.files import fingerprint
-from sfm_app.frame.georeference import enu_m, position_from_enu
+from sfm_app.files import fingerprint, read_text
+from sfm_app.frame.coordinates import GPS_SYSTEM, CoordinateSystem, LocalFrame, read_system
 from sfm_app.frame.sighted_points import SightedPoint
 from sfm_app.geometry.poses import Similarity, robust_similarity, umeyama
 from sfm_app.numerical import FAILURES
 from sfm_app.types import ControlPoint, ControlPoints, GpsPosition
 from sfm_app.types.arrays import FloatArray
+from sfm_app.wording import format_length
 
 # The file, OpenDroneMap's gcp_list.txt.
 # The first line is the coordinate system: EPSG:32632, a proj string such as "+proj=utm +zone=32 +datum=WGS84", or
@@ -25,26 +29,27 @@ from sfm_app.types.arrays import FloatArray
 # the same name, or without names at the same position, belong to one point.
 
 FORM = (
-    "the first line is a coordinate system such as EPSG:32632, each other one: geo_x geo_y geo_z pixel_x pixel_y photo "
-    "[name]"
+    "the first line is a coordinate system such as EPSG:32632, or `local` for meters along your own axes; each other "
+    "one: geo_x geo_y geo_z pixel_x pixel_y photo [name], with east or longitude first"
 )
-GEOGRAPHIC = re.compile(r"\+proj=(longlat|latlong)|^EPSG:4326$|^WGS ?84$", re.IGNORECASE)
-FEET = re.compile(r"\+units=(us-)?ft|\+to_meter", re.IGNORECASE)
+MOST_BYTES, MOST_WORDS = 10_000_000, 20
+"""Largest file, and words of the name of a photo. Chosen by hand."""
+SUFFIX = re.compile(r".+?\.[A-Za-z]\w{2,4}(?=\s|$)")
+"""The name of a photo, with blanks, up to its suffix."""
+ZONE = re.compile(r"(?<=zone[ =])\d+", re.IGNORECASE)
+"""Number of a zone of UTM or Gauss-Kruger in the name of a system or in a PROJ string."""
 
 
-def read_control_points(path: Path) -> ControlPoints:
-    """Read a file of ground control points; raise an InputError that names a malformed line."""
+def read_control_points(path: Path, files: Collection[str] = ()) -> ControlPoints:
+    """Read a file of ground control points; raise an InputError that names a malformed line.
+
+    `files` are those of the folder of photos, with forward slashes; none of a video.
+    """
     try:
-        if path.stat().st_size > 10_000_000:
-            raise ValueError("it is larger than 10 MB")
-        lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
-        crs = lines[0] if lines else ""
-        if not crs or crs.startswith("#"):
-            raise ValueError("its first line names no coordinate system")
-        if FEET.search(crs):
-            raise ValueError("its coordinate system is not in meters")
-        geographic = GEOGRAPHIC.search(crs) is not None
-        points = _read_marks(lines, geographic)
+        lines = [(number, line.strip()) for number, line in enumerate(read_text(path, MOST_BYTES).splitlines(), 1)]
+        lines = [line for line in lines if line[1] and not line[1].startswith("#")]
+        system, header = _read_header(lines)
+        points = _read_marks(lines, system, files)
         if not points:
             raise ValueError("it holds no point")
     except OSError as err:
@@ -53,39 +58,111 @@ def read_control_points(path: Path) -> ControlPoints:
     except ValueError as err:
         raise InputError(f"{path} holds no ground control points: {err}", hint=FORM) from err
     content = [[one.name, one.position, one.marks] for one in points]
-    return ControlPoints(points, crs, geographic, str(path), fingerprint(crs, content))
+    return ControlPoints(points, header, str(path), fingerprint(header, content))
 
 
-def _read_marks(lines: list[str], geographic: bool) -> tuple[ControlPoint, ...]:
-    names: dict[tuple[object, ...], str] = {}
-    positions: dict[str, tuple[float, float, float]] = {}
+def _read_header(lines: list[tuple[int, str]]) -> tuple[CoordinateSystem, str]:
+    """Take the coordinate system from the lines; WKT may have several."""
+    if not lines:
+        raise ValueError("it names no coordinate system")
+    number, header = lines.pop(0)
+    while header.count("[") > header.count("]") and lines:
+        header += lines.pop(0)[1]
+    if re.match(r"([-+]?\d[\d.,]*[\s;,]+){3}", header):
+        raise ValueError(f"line {number} is a mark, where the coordinate system must stand: insert a line above it")
+    try:
+        return read_system(header), header
+    except ValueError as err:
+        raise ValueError(f"line {number}: {err}") from None
+
+
+Position = tuple[float, float, float]
+
+
+def _read_marks(
+    lines: Sequence[tuple[int, str]], system: CoordinateSystem, files: Collection[str]
+) -> tuple[ControlPoint, ...]:
+    index, missing = _index_files(files), list[str]()
+    names: dict[Position, str] = {}
+    positions: dict[str, Position] = {}
     marks: dict[str, dict[str, tuple[float, float]]] = {}
-    for number, line in enumerate(lines[1:], start=2):
-        if not line or line.startswith("#"):
-            continue
+    for number, line in lines:
         try:
-            position, mark, photo, name = _read_mark(line, geographic)
+            position, mark, tails = _read_mark(line)
+            photo, name, is_there = _find_photo(tails, index)
         except ValueError as err:
             raise ValueError(f"line {number} {err}") from None
         name = name or names.setdefault(position, f"point {len(names) + 1}")
+        if name not in positions:
+            _check_position(position, system, number)
         if positions.setdefault(name, position) != position:
             raise ValueError(f"line {number} gives '{name}' another position than an earlier line")
         marks.setdefault(name, {})[photo] = mark
+        missing += [] if is_there else [f"line {number} names the photo '{photo}', which the folder does not have"]
+    if files and lines and len(missing) == len(lines):
+        raise ValueError(missing[0])
     return tuple(ControlPoint(name, positions[name], marks[name]) for name in positions)
 
 
-def _read_mark(line: str, geographic: bool) -> tuple[tuple[float, float, float], tuple[float, float], str, str]:
-    """Return the position, the mark, its photo and the name of the point, which may be empty."""
-    words = line.split("\t") if "\t" in line else line.split()
+def _read_mark(line: str) -> tuple[Position, tuple[float, float], list[tuple[str, str]]]:
+    """Return the position, the mark, and each way to divide the rest into a photo and the name of the point."""
+    divider = next((sign for sign in "\t;," if line.count(sign) >= 5), None)
+    words = line.split(divider, 5)
     try:
-        east, north, up, x, y = map(float, words[:5])
-        photo = words[5].strip()
+        x, y, z, column, row = map(float, words[:5])
+        tail = words[5].strip()
     except (ValueError, IndexError):
         raise ValueError("is malformed") from None
-    on_earth = not geographic or (-180 <= east <= 360 and -90 <= north <= 90)
-    if not all(map(math.isfinite, (east, north, up, x, y))) or not on_earth:
+    if not all(map(math.isfinite, (x, y, z, column, row))):
         raise ValueError("has a value out of range")
-    return (east, north, up), (x, y), photo, words[6].strip() if len(words) > 6 else ""
+    if divider is not None:
+        photo, _, name = tail.partition(divider)
+        return (x, y, z), (column, row), [(photo.strip(), name.partition(divider)[0].strip())]
+    gaps = islice(re.finditer(r"\s+|$", tail), MOST_WORDS)
+    tails = [(tail[: gap.start()], (tail[gap.end() :].split(maxsplit=1) or [""])[0]) for gap in gaps]
+    return (x, y, z), (column, row), tails[::-1]
+
+
+def _check_position(position: Position, system: CoordinateSystem, line: int) -> None:
+    x, y, z = position
+    there, swapped = np.isfinite(system.geocentric_m(np.array([[x, y, z], [y, x, z]]))[:, 0])
+    if not there:
+        advice = "; longitude or east comes first: swap them" if swapped else ""
+        raise ValueError(f"line {line} has a position out of range of the system {system.name}{advice}")
+
+
+def _index_files(files: Collection[str]) -> tuple[dict[str, list[str]], ...]:
+    """Return files by what marks may call them: path, name, name in other case, the same without suffix."""
+    index: tuple[dict[str, list[str]], ...] = ({}, {}, {}, {})
+    for file in files:
+        path = PurePosixPath(file)
+        is_picture = (mimetypes.guess_type(file)[0] or "").startswith("image/")  # no sidecar
+        keys = [file, path.name, path.name.casefold(), path.stem.casefold() if is_picture else file]
+        for known, key in zip(index, keys, strict=True):
+            known.setdefault(key, []).append(file)
+    return index
+
+
+def _find_photo(
+    tails: Sequence[tuple[str, str]], index: Sequence[Mapping[str, Sequence[str]]]
+) -> tuple[str, str, bool]:
+    """Return the photo of a mark, the name of its point, and whether the photo is a file of the folder.
+
+    `tails` are pairs of both, the longest photo first. A ValueError says that several photos fit equally well.
+    """
+    for level, known in enumerate(index):
+        fits: dict[str, str] = {}
+        for photo, point in tails:
+            name = photo.replace("\\", "/").rpartition("/")[2] if level else photo
+            for file in known.get(name.casefold() if level > 1 else name, ()):
+                fits.setdefault(file, point)
+        if len(fits) > 1:
+            raise ValueError(f"may mean {' or '.join(sorted(fits))}: write the path of the photo")
+        if fits:
+            return (*fits.popitem(), True)
+    suffixed = SUFFIX.match(tails[0][0])
+    photo, point = next((one for one in tails if suffixed and one[0] == suffixed[0]), tails[-1])
+    return photo, point, False
 
 
 SIGNIFICANCE = 0.002
@@ -104,10 +181,13 @@ class ControlFit:
     """A model placed on ground control points."""
 
     from_model: Similarity
-    """To x east, y up and z south of the offset, in meters."""
+    """To x east, y up and z south of the offset, in meters; x and z may follow a grid."""
     crs: str
+    """Name of the grid, or place of the frame's origin."""
     offset: tuple[float, float, float]
-    """East, north and up of (0, 0, 0)."""
+    """(0, 0, 0) in units of the grid."""
+    units_per_m: tuple[float, float]
+    """Units of the grid per meter: horizontal, vertical."""
     deviation: float
     """Relative standard deviation of the scale."""
     rms_m: float
@@ -121,22 +201,58 @@ def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]
     points = [point for point in given.points if point.name in located]
     if len(points) < 3:
         return f"{len(points)} of {len(given.points)} ground control points have a place in the model, 3 are needed"
-    targets, crs, offset = _target_positions(points, given)
-    places = np.array([located[point.name].place for point in points])
-    try:
-        used = agreeing_points(places, targets)
-    except FAILURES:
+    sights = [located[point.name] for point in points]
+    placed = _place(read_system(given.crs), np.array([point.position for point in points]), sights)
+    if placed is None:
         return "the ground control points lie on a line: they do not determine the up direction"
-    fit = umeyama(places[used], targets[used])
-    distances = np.linalg.norm(fit(places) - targets, axis=1)
-    rms = float(np.sqrt(np.mean(distances[used] ** 2)))
+    frame, used, distances, fit = placed.frame, placed.used, placed.distances, placed.fit
     names = [point.name for point in points]
     inliers = tuple(name for name, inlier in zip(names, used, strict=True) if inlier)
     outliers = {name: float(miss) for name, inlier, miss in zip(names, used, distances, strict=True) if not inlier}
-    variances = [np.trace(located[name].covariance) / 3 for name in inliers]
-    sigma = max(_sigma(distances[used]), fit.scale * float(np.sqrt(np.mean(variances))), MIN_SIGMA_M)
-    spread = float(np.sqrt((np.square(places[used] - places[used].mean(axis=0))).sum()))
-    return ControlFit(fit, crs, offset, sigma / (fit.scale * spread), rms, inliers, outliers)
+    marks = fit.scale * _mark_deviation([located[name] for name in inliers])
+    deviation = max(_sigma(distances[used]), marks, MIN_SIGMA_M) / float(np.sqrt(used.sum())) / placed.spread(used)
+    east, north, up = frame.origin.tolist() if frame.has_grid else (0.0, 0.0, 0.0)
+    units = frame.units_per_m if frame.has_grid else (1.0, 1.0)
+    return ControlFit(fit, frame.describe(), (east, north, up), units, deviation, placed.miss(used), inliers, outliers)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Placed:
+    """A model placed on positions."""
+
+    frame: LocalFrame
+    targets: FloatArray
+    """(N, 3) positions as x east, y up and z south in the frame, in meters."""
+    used: NDArray[np.bool_]
+    fit: Similarity
+    distances: FloatArray
+    """(N,) from the targets, in meters."""
+
+    def miss(self, rows: NDArray[np.bool_] | slice = slice(None)) -> float:
+        """Return the root mean square of distances."""
+        return float(np.sqrt(np.mean(self.distances[rows] ** 2)))
+
+    def spread(self, rows: NDArray[np.bool_] | slice = slice(None)) -> float:
+        """Return the root mean square of the distances of targets from their middle."""
+        return float(np.sqrt(self.targets[rows].var(axis=0).sum()))
+
+
+def _place(system: CoordinateSystem, positions: FloatArray, sights: Sequence[SightedPoint]) -> _Placed | None:
+    """Fit the similarity from the model to positions (N, 3); None if they do not determine it."""
+    places = np.array([one.place for one in sights])
+    try:
+        frame = LocalFrame.around(system, positions)
+        targets = frame(positions) @ EAST_UP_SOUTH.T
+        used = agreeing_points(places, targets)
+    except FAILURES:
+        return None
+    fit = umeyama(places[used], targets[used])
+    return _Placed(frame, targets, used, fit, np.linalg.norm(fit(places) - targets, axis=1))
+
+
+def _mark_deviation(sights: Sequence[SightedPoint]) -> float:
+    """Return the standard deviation of a coordinate in the model by the marks of points."""
+    return float(np.sqrt(np.mean([np.trace(one.covariance) / 3 for one in sights])))
 
 
 def agreeing_points(places: FloatArray, targets: FloatArray) -> NDArray[np.bool_]:
@@ -191,17 +307,89 @@ def _sigma(distances: FloatArray) -> float:
     return float(widening * np.sqrt((distances**2).sum() / freedom))
 
 
-def _target_positions(
-    points: Sequence[ControlPoint], given: ControlPoints
-) -> tuple[FloatArray, str, tuple[float, float, float]]:
-    """Return the positions (N, 3) in the frame of exported files, their coordinate system, and the frame's origin."""
-    positions = np.array([point.position for point in points])
-    if not given.geographic:
-        offset = np.round(positions.mean(axis=0))
-        east, north, up = map(float, offset)
-        return (positions - offset) @ EAST_UP_SOUTH.T, given.crs, (east, north, up)
-    known = [GpsPosition(latitude, longitude, height) for longitude, latitude, height in positions.tolist()]
-    middle = GpsPosition(*(float(value) for value in np.median(positions, axis=0)[[1, 0, 2]]))
-    origin = position_from_enu(np.zeros(3), middle)
-    place = f"{origin.latitude_deg:.8f}, {origin.longitude_deg:.8f}, {origin.altitude_m:.3f}"
-    return enu_m(known, origin) @ EAST_UP_SOUTH.T, f"meters east, north and up of {place}", (0.0, 0.0, 0.0)
+# Mistakes that explain why points fit badly, or lie in another place than the photos.
+
+
+@dataclass(frozen=True, slots=True)
+class MistakeOptions:
+    """Constants of the search for mistakes, chosen by hand."""
+
+    max_share: float = 0.01
+    """Largest miss of sound points, as a share of their spread."""
+    max_deviations: float = 5.0
+    """The same in standard deviations of the marks; only a miss above both is too large."""
+    max_outliers: float = 0.34
+    """Largest share of rejected points."""
+    min_gain: float = 3.0
+    """Least factor by which correcting a mistake reduces misses that are too large."""
+    max_degrees: float = 3.0
+    """How far points may lie outside of the area of their system: half a zone of UTM."""
+    max_away_m: float = 5000.0
+    """How far points may lie from the GPS positions of the photos."""
+
+
+MISTAKES = MistakeOptions()
+
+
+def find_mistake(
+    given: ControlPoints, located: Mapping[str, SightedPoint], gps: Sequence[GpsPosition]
+) -> tuple[str, bool]:
+    """Return what is probably wrong with the file, empty if nothing is, and whether the points are unusable.
+
+    Each plausible mistake is corrected, and the misses are compared. `gps` has the positions of the photos.
+    """
+    points = [point for point in given.points if point.name in located]
+    sights = [located[point.name] for point in points]
+    system, positions = read_system(given.crs), np.array([point.position for point in points])
+    now = _place(system, positions, sights)
+    symptom = "" if now is None else _symptom(now, sights, gps)
+    if now is None or not symptom:
+        return "", False
+    share, causes = now.miss() / now.spread(), list[tuple[float, str, bool]]()
+    largest = share / MISTAKES.min_gain if symptom.startswith(MISS) else 1.5 * share + MISTAKES.max_share / 3
+    for mistake, keeps_shape, other, corrected in _plausible_mistakes(system, positions):
+        then = _place(other, corrected, sights)
+        if then is not None and then.miss() < largest * then.spread() and not _symptom(then, sights, gps):
+            text = f"probably because {mistake}: if so, they miss by {format_length(then.miss())}; correct the file"
+            causes.append((then.miss() / then.spread(), text, keeps_shape))
+    if not causes and symptom == UPSIDE_DOWN:  # the model's up may be wrong
+        return "", False
+    _, cause, keeps_shape = min(causes, default=(0.0, "check the coordinate system and the order of the columns", True))
+    return f"the ground control points {symptom}, {cause}", not keeps_shape
+
+
+MISS, UPSIDE_DOWN = "miss their places", "turn the model upside down"
+
+
+def _plausible_mistakes(
+    system: CoordinateSystem, positions: FloatArray
+) -> Iterator[tuple[str, bool, CoordinateSystem, FloatArray]]:
+    """Yield a mistake, whether it leaves lengths as they are, and the corrected system and positions."""
+    pair = "latitude and longitude" if system.crs.is_geographic else "x and y"
+    yield f"{pair} are swapped", False, system, positions[:, [1, 0, 2]]
+    if system.z_m != 1.0 and not system.has_heights:
+        yield "heights are in meters", False, system, positions / [1.0, 1.0, system.z_m]
+    if zone := ZONE.search(system.title):
+        for other in (int(zone[0]) - 1, int(zone[0]) + 1):
+            with contextlib.suppress(ValueError):
+                neighbor = read_system(ZONE.sub(str(other), system.title, count=1))
+                yield f"the zone is {other}", True, neighbor, positions
+
+
+def _symptom(placed: _Placed, sights: Sequence[SightedPoint], gps: Sequence[GpsPosition]) -> str:
+    """Return what is wrong with placed points, for people; empty if nothing is."""
+    system, used = placed.frame.system, placed.used
+    sigma = placed.fit.scale * _mark_deviation(sights)
+    largest = max(MISTAKES.max_share * placed.spread(), MISTAKES.max_deviations * sigma)
+    if placed.miss(used) > largest or np.mean(~used) > MISTAKES.max_outliers:
+        return f"{MISS} by {format_length(placed.miss())}"
+    outside = system.degrees_outside(placed.frame.center)
+    if outside > MISTAKES.max_degrees:
+        return f"lie {outside:.0f} degrees outside of the area of {system.name}"
+    if gps and not system.is_flat:
+        photos = [[one.longitude_deg, one.latitude_deg, one.altitude_m or 0.0] for one in gps]
+        middle = np.median(read_system(GPS_SYSTEM).geocentric_m(np.array(photos)), axis=0)
+        away = float(np.linalg.norm(middle - placed.frame.center))
+        if away > MISTAKES.max_away_m:
+            return f"lie {format_length(away)} from the GPS positions of the photos"
+    return UPSIDE_DOWN if placed.fit.R[1, 1] < 0 and not system.is_flat else ""

@@ -6,13 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.frame.coordinates import GPS_SYSTEM, LocalFrame, read_system
 from sfm_app.geometry.poses import Similarity, draw_pairs, perpendicular_basis, robust_similarity
 from sfm_app.numerical import FAILURES, MAD_TO_SIGMA
 from sfm_app.types import GpsPosition, Rejected
 from sfm_app.types.arrays import FloatArray
 
-EQUATOR_M = 6378137.0
-"""Radius of the equator, in meters (WGS84). By definition."""
 MIN_POSITIONS = 3
 """Least number of distinct positions that must agree."""
 
@@ -32,6 +31,8 @@ class GpsOptions:
     max_up_deviation_deg: float = 2.0
     """Largest standard deviation with which up from GPS replaces up from the cameras' roll."""
     max_pairs: int = 500
+    min_swap_gain: float = 2.0
+    """Least factor by which swapping latitude and longitude reduces the residuals of a file that has them swapped."""
 
 
 OPTIONS = GpsOptions()
@@ -65,14 +66,36 @@ def georeference(
     are used: w = a z + b in complex numbers, by RANSAC over pairs, then least squares. An unsure up is replaced by that
     of the positions if they determine it well. Centers (N, 3) and `up` (3,) are in the frame of the reconstruction.
     """
-    known = [k for k, position in enumerate(positions) if position is not None]
+    cameras = centers[[position is not None for position in positions]]
     given = [position for position in positions if position is not None]
     if not given:
         return Rejected("the photos have no positions")
     if len(set(given)) < MIN_POSITIONS:
         return Rejected(f"{len(set(given))} different positions, {MIN_POSITIONS} are needed")
+    fit = _fit_positions(cameras, given, up, up_is_sure)
+    if max(abs(one.longitude_deg) for one in given) > 90.0:
+        return fit
+    swapped = [GpsPosition(one.longitude_deg, one.latitude_deg, one.altitude_m) for one in given]
+    other = _fit_positions(cameras, swapped, up, up_is_sure)
+    rms_m = fit.rms_m if isinstance(fit, Georeference) else np.inf
+    if isinstance(other, Georeference) and OPTIONS.min_swap_gain * other.rms_m < min(rms_m, _width(swapped)):
+        now = f"they miss by {rms_m:.2g} m" if fit else "they do not agree"
+        return Rejected(
+            f"latitude and longitude are probably swapped: {now}, and swapped by {other.rms_m:.2g} m; correct the EXIF"
+        )
+    return fit
+
+
+def _width(positions: Sequence[GpsPosition]) -> float:
+    """Return the deviation of positions across their main horizontal direction in meters. A line also fits mirrored."""
+    return float(np.sqrt(np.linalg.eigvalsh(np.cov(enu_m(positions, _median_position(positions))[:, :2].T))[0]))
+
+
+def _fit_positions(
+    cameras: FloatArray, given: Sequence[GpsPosition], up: FloatArray, up_is_sure: bool
+) -> Georeference | Rejected:
     origin = _median_position(given)
-    enu, cameras = enu_m(given, origin), centers[known]
+    enu = enu_m(given, origin)
     level = _fit_on_ground(cameras, enu, up, origin)
     if up_is_sure and level:
         return level
@@ -82,45 +105,34 @@ def georeference(
 
 
 def enu_m(positions: Sequence[GpsPosition], origin: GpsPosition) -> FloatArray:
-    """Return (N, 3) meters east, north and up of an origin, up 0 if an altitude is unknown; it is 1 m off at 5 km."""
-    meridian, parallel = _radii_m(origin)
-    longitude = [(position.longitude_deg - origin.longitude_deg + 180.0) % 360.0 - 180.0 for position in positions]
-    east = parallel * np.radians(longitude)
-    north = meridian * np.radians([position.latitude_deg - origin.latitude_deg for position in positions])
-    altitude = origin.altitude_m
-    up = [
-        0.0 if altitude is None or position.altitude_m is None else position.altitude_m - altitude
-        for position in positions
-    ]
-    return np.column_stack([east, north, up])
+    """Return (N, 3) meters east, north and up of an origin; a position without altitude has that of the origin."""
+    return _frame(origin)(_coordinates(positions, origin.altitude_m))
 
 
 def position_from_enu(enu: FloatArray, origin: GpsPosition) -> GpsPosition:
     """Return the position (3,) meters east, north and up of an origin; the inverse of `enu_m`."""
-    meridian, parallel = _radii_m(origin)
-    longitude = (origin.longitude_deg + float(np.degrees(enu[0] / parallel)) + 180.0) % 360.0 - 180.0
-    altitude = None if origin.altitude_m is None else origin.altitude_m + float(enu[2])
-    return GpsPosition(origin.latitude_deg + float(np.degrees(enu[1] / meridian)), longitude, altitude)
+    longitude, latitude, altitude = _frame(origin).positions(enu[None])[0].tolist()
+    return GpsPosition(latitude, longitude, None if origin.altitude_m is None else altitude)
 
 
-def _radii_m(origin: GpsPosition) -> tuple[float, float]:
-    """Return the radius of curvature along the meridian and the radius of the parallel, at the origin's altitude."""
-    latitude = np.radians(origin.latitude_deg)
-    flattening = 1.0 / 298.257223563  # WGS84
-    squared = flattening * (2.0 - flattening)
-    across = EQUATOR_M / np.sqrt(1.0 - squared * np.sin(latitude) ** 2)
-    meridian = across * (1.0 - squared) / (1.0 - squared * np.sin(latitude) ** 2)
-    height = origin.altitude_m or 0.0
-    return float(meridian + height), float(max((across + height) * np.cos(latitude), 1.0))
+def _frame(origin: GpsPosition) -> LocalFrame:
+    return LocalFrame(read_system(GPS_SYSTEM), _coordinates([origin], origin.altitude_m)[0])
+
+
+def _coordinates(positions: Sequence[GpsPosition], altitude_m: float | None) -> FloatArray:
+    """Return longitude, latitude and altitude (N, 3); a position without altitude has this one, all if it is None."""
+    base = altitude_m or 0.0
+    heights = [base if None in (altitude_m, one.altitude_m) else one.altitude_m for one in positions]
+    return np.array([(one.longitude_deg, one.latitude_deg, up) for one, up in zip(positions, heights, strict=True)])
 
 
 def _median_position(positions: Sequence[GpsPosition]) -> GpsPosition:
-    first = positions[0].longitude_deg
-    offset = np.median([(position.longitude_deg - first + 180.0) % 360.0 - 180.0 for position in positions])
-    longitude = (first + float(offset) + 180.0) % 360.0 - 180.0
     altitudes = [position.altitude_m for position in positions if position.altitude_m is not None]
-    latitude = float(np.median([position.latitude_deg for position in positions]))
-    return GpsPosition(latitude, longitude, float(np.median(altitudes)) if altitudes else None)
+    altitude = float(np.median(altitudes)) if altitudes else None
+    longitude, latitude, _ = LocalFrame.around(
+        read_system(GPS_SYSTEM), _coordinates(positions, altitude)
+    ).origin.tolist()
+    return GpsPosition(latitude, longitude, altitude)
 
 
 def _fit_on_ground(

@@ -1,6 +1,7 @@
 """Known lengths in a scene as evidence of its scale: distances, markers and ground control points."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -50,6 +51,25 @@ def marker_evidence(posed: PosedPhotos, run: RunContext, problems: list[str]) ->
     if not any(markers.values()):
         problems.append("no photo shows a marker; print a page of them with `sfm-app markers`")
     return evidence
+
+
+def is_normalized(given: ControlPoints) -> bool:
+    """Return whether marks seem to be shares of the width and height of the photo instead of pixels."""
+    return all(0.0 <= value <= 1.0 for point in given.points for mark in point.marks.values() for value in mark)
+
+
+def marks_in_pixels(photos: PhotoSet, given: ControlPoints) -> ControlPoints:
+    """Return points whose marks are shares of width and height with marks in pixels of the upright photos."""
+    names, points = named_photos(photos.photos), []
+    for point in given.points:
+        marks = {}
+        for name in point.marks.keys() & names.keys():
+            photo, mark = names[name], point.marks[name]
+            size = (photo.height, photo.width) if photo.turn_deg % 180 else (photo.width, photo.height)
+            scale = layout_scale(photo, photos.folder)
+            marks[name] = (mark[0] * size[0] / scale, mark[1] * size[1] / scale)
+        points.append(replace(point, marks=marks))
+    return replace(given, points=tuple(points))
 
 
 def control_places(

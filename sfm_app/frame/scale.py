@@ -43,7 +43,9 @@ class MetricFrame:
     crs: str = ""
     """Coordinate system of ground control points; empty without any."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """East, north and up of the frame's origin in that system: x is east, y up and z south of it."""
+    """Position of the frame's origin in that system: x is east, y up and z south of it."""
+    units_per_m: tuple[float, float] = (1.0, 1.0)
+    """Units of that system per meter, horizontal and vertical."""
 
     @property
     def is_metric(self) -> bool:
@@ -69,6 +71,7 @@ class MetricFrame:
         similarity = Similarity(float(values["scale"]), R, t)
         unchanged = similarity.scale == 1.0 and (np.eye(3) == R).all() and not t.any()
         east, north, up = map(float, values["offset"])
+        horizontal, vertical = map(float, values["units_per_m"])
         return cls(
             IDENTITY if unchanged else similarity,
             values["deviation"],
@@ -77,6 +80,7 @@ class MetricFrame:
             tuple(values["contradictions"]),
             values["crs"],
             (east, north, up),
+            (horizontal, vertical),
         )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from PIL import Image
 
 from sfm_app.errors import InputError
-from sfm_app.files import PROGRAM, RUN_FOLDERS, is_made_by_run, recorded_files
+from sfm_app.files import PROGRAM, RUN_FOLDERS, is_made_by_run, read_text, recorded_files
 from sfm_app.operating_system import is_link
 
 EXTENSIONS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts", ".3gp")
@@ -53,6 +53,8 @@ def _has_packets(head: bytes, first: int, length: int) -> bool:
     return len(head) == HEAD_BYTES and all(head[k] == 0x47 for k in range(first, HEAD_BYTES, length))
 
 
+MOST_LIST_BYTES = 100_000_000
+"""Largest list of photos: a million names."""
 HINT = "name the folder that holds the photos"
 
 
@@ -249,12 +251,11 @@ def resolve_file(folder: Path, name: str) -> Path | str:
 def _read_list(file: Path, folder: Path) -> list[str]:
     """Return the names in a list, as seen from the folder; lines that begin with # and name no file are comments."""
     try:
-        data = file.read_bytes()
-        text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+        lines = read_text(file, MOST_LIST_BYTES).splitlines()
     except (OSError, ValueError) as err:
-        reason = err.strerror if isinstance(err, OSError) else "not a UTF-8 text"
+        reason = err.strerror if isinstance(err, OSError) else str(err)
         raise InputError(f"cannot read {file}: {reason}", hint="one photo per line, as seen from the folder") from err
-    names = {_name_in(folder, line, file.parent) for line in text.splitlines() if line.strip()}
+    names = {_name_in(folder, line, file.parent) for line in lines if line.strip()}
     return sorted(name for name in names if name and not (name.startswith("#") and not os.path.lexists(folder / name)))
 
 

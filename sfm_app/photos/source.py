@@ -127,14 +127,22 @@ def _digests(folder: Path, names: Sequence[str], spread: ParallelMap) -> dict[st
     return dict(zip(names, spread(file_digest, names), strict=True))
 
 
+MOST_NAME_BYTES = 200
+"""Bytes of a file's name, of which file systems allow 255: later stages append words such as `.geometric.bin`."""
+
+
 def assign_names(photos: Iterable[Photo]) -> Iterator[Photo]:
-    """Yield photos with unique printable names, also without case, and an extension that COLMAP writes."""
+    """Yield photos with unique printable names of few bytes, also without case, and an extension that COLMAP writes."""
     photos = list(photos)
     given, taken = {photo.path.casefold() for photo in photos}, set[str]()
     for photo in photos:
         name = "".join(c if c.isprintable() else "_" for c in photo.path)
         if PurePosixPath(name).suffix.lower() not in (".jpg", ".jpeg", ".png"):
             name += ".jpg" if photo.lossy else ".png"
+        own = PurePosixPath(name)
+        if len(own.name.encode()) > MOST_NAME_BYTES:
+            stem = own.stem.encode()[: MOST_NAME_BYTES - len(own.suffix)].decode(errors="ignore")
+            name = str(own.with_name(stem + own.suffix))
         while name.casefold() in taken or (name != photo.path and name.casefold() in given):
             name = str(PurePosixPath(name).with_name(f"_{PurePosixPath(name).name}"))
         taken.add(name.casefold())

@@ -120,7 +120,7 @@ def render_page(contents: RunContents, parts: LargeParts, other: RunContents | N
     model = _read_model(contents)
     rows = photo_rows(contents, model, parts.pictures)
     warnings, others = findings.remarks(contents)
-    return _environment().get_template("page.html.jinja").render(
+    page = _environment().get_template("page.html.jinja").render(
         title=contents.run.workspace.root.resolve().name,
         headline=headline(contents, rows),
         problem=contents.problem,
@@ -144,6 +144,7 @@ def render_page(contents: RunContents, parts: LargeParts, other: RunContents | N
         data=script_data({"view": parts.view, "photos": [_photo_data(row) for row in rows]}),
         three=Markup(three_script()),  # noqa: S704 - a script of an installed package, without user text
     )  # fmt: skip
+    return page.encode("utf-8", "replace").decode("utf-8")  # names of files need not be text
 
 
 def _read_model(contents: RunContents) -> ModelFigures | None:

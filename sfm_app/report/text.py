@@ -325,6 +325,8 @@ def _orientation_lines(orientation: Mapping[str, Any]) -> Iterator[str]:
     accuracy = f"to about {max(deviation, 0.1):.1f} degrees" if deviation is not None else "with unknown accuracy"
     meters = "; in meters by GPS" if orientation["unit"] == "meter" else ""  # the stage `scale` may know others
     yield f"upright by {orientation['up']}, {accuracy}{meters}"
+    if "swapped" in orientation.get("gps", ""):
+        yield f"beware: GPS is {orientation['gps']}"
     mistakes = {"up_sign_odds": ("stand upside down", (180,)), "up_axis_odds": ("lie on its side", (90, 270))}
     for key, (what, turns) in mistakes.items():
         odds = orientation.get(key, UNSURE_ODDS)

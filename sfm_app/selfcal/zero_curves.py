@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_app.camera.models import FOCAL, LENS
+from sfm_app.camera.models import CENTER, FOCAL, LENS
 from sfm_app.selfcal.adjustment import Matches
 from sfm_app.selfcal.calibrate_pairs import (
     Fit,
@@ -46,8 +46,8 @@ from sfm_app.selfcal.pairs import (
 )
 from sfm_app.selfcal.priors import PRIORS, CameraPriors, claim_rows
 from sfm_app.settings import CalibrationSettings
-from sfm_app.types import Calibration, CameraPairs
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types import Calibration, CameraPairs, CameraPrior
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 METHOD = "zero-curves"
 
@@ -123,8 +123,9 @@ def _calibrate_from_matches(
     sigma = options.center_sigma * pairs.size[0] / side
     priors = CameraPriors(np.ones(1), claim_rows([pairs.prior], [pairs.size], side), sigma, options.lens)
     adjusted = _adjust(pairs, usable, priors)
-    if adjusted.fit.free[0, FOCAL] and pairs.prior is not None:  # rejected: it is no evidence, and may not cost any
-        return _calibrate_from_matches(replace(pairs, prior=None), usable, options, evidence)
+    rest = _unrejected(pairs.prior, adjusted.fit.free[0])
+    if rest != pairs.prior:  # what is rejected is no evidence, and may not cost any
+        return _calibrate_from_matches(replace(pairs, prior=rest), usable, options, evidence)
     if adjusted.is_contradicted:
         adjusted = max(adjusted, _adjust(pairs, usable, priors, adjusted), key=lambda one: one.vote_share)
     fit, peak, weights = adjusted.fit, adjusted.peak, adjusted.consensus.pairs.weights
@@ -156,6 +157,14 @@ def _calibrate_from_matches(
     doubt = uncertainty_reason(spread) or peak.rival_reason(weights)
     doubt = doubt or (peak.aspect_reason if "aspect" in calibration.held else "")
     return downgrade_to_estimate(calibration, doubt)
+
+
+def _unrejected(prior: CameraPrior | None, free: BoolArray) -> CameraPrior | None:
+    """Return a claim without the parts (4,) that the pairs have freed; None where they have freed its focal."""
+    if prior is None or free[FOCAL]:
+        return None
+    center, k1 = None if free[CENTER] else prior.center_px, None if free[LENS] else prior.k1
+    return replace(prior, center_px=center, k1=k1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,13 +6,20 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_app.colmap.model import sparse_model
-from sfm_app.frame.control_points import ControlFit, fit_control_points
-from sfm_app.frame.known_lengths import control_places, distance_evidence, marker_evidence
+from sfm_app.frame.control_points import ControlFit, find_mistake, fit_control_points
+from sfm_app.frame.known_lengths import (
+    control_places,
+    distance_evidence,
+    is_normalized,
+    marker_evidence,
+    marks_in_pixels,
+)
 from sfm_app.frame.scale import GPS, MetricFrame, ScaleEvidence, agree, move_model
 from sfm_app.frame.sighted_points import PosedPhotos
 from sfm_app.products import write_frame
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import PhotoSet, Scene
+from sfm_app.wording import format_length
 
 POINTS = "points"
 """Name of the files with the points and cameras."""
@@ -66,15 +73,28 @@ def _control_evidence(
     photos: PhotoSet, posed: PosedPhotos, run: RunContext, evidence: list[ScaleEvidence], problems: list[str]
 ) -> ControlFit | None:
     """Return the fit to ground control points, and add to the evidence and the problems."""
-    located = control_places(photos, posed, run.control_points, problems)
-    fit = fit_control_points(run.control_points, located)
+    given = run.control_points
+    if is_normalized(given):
+        given = marks_in_pixels(photos, given)
+        fit = fit_control_points(given, control_places(photos, posed, given, []))
+        reason = fit if isinstance(fit, str) else f"so read, the points miss by {format_length(fit.rms_m)}"
+        problems.append(f"all marks lie between 0 and 1, as shares of width and height ({reason}): write pixels")
+        return None
+    located = control_places(photos, posed, given, problems)
+    fit = fit_control_points(given, located)
     if isinstance(fit, str):
         problems.append(fit)
+        return None
+    mistake, unusable = find_mistake(given, located, [photo.gps for photo in photos.photos if photo.gps is not None])
+    if mistake:
+        problems.append(f"{mistake}. They are not used" if unusable else mistake)
+    if unusable:
         return None
     for name, miss in fit.outliers.items():
         problems.append(f"ground control point '{name}' contradicts the others: it is {miss:.3g} m off, and left out")
     evidence.append(ScaleEvidence(f"{len(fit.inliers)} ground control points", fit.from_model.scale, fit.deviation))
-    run.record(control_points={"used": list(fit.inliers), "wrong": dict(fit.outliers), "rms_m": fit.rms_m})
+    used = {"used": list(fit.inliers), "wrong": dict(fit.outliers), "rms_m": fit.rms_m}
+    run.record(control_points={"system": fit.crs, **used})
     return fit
 
 
@@ -90,4 +110,5 @@ def _agreed_frame(evidence: Sequence[ScaleEvidence], control: ControlFit | None,
         deviation=max(float(np.hypot(control.deviation, shape)), difference),
         crs=control.crs,
         offset=control.offset,
+        units_per_m=control.units_per_m,
     )

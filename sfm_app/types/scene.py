@@ -135,8 +135,7 @@ class ControlPoint:
 
     name: str
     position: tuple[float, float, float]
-    """East, north and up in the coordinate system of the file, in meters; longitude, latitude and meters if that is
-    geographic."""
+    """In the units of the file's coordinate system: x, y and z, or longitude, latitude and height."""
     marks: Mapping[str, tuple[float, float]]
     """By photo: x and y in pixels of the upright photo at its full size; pixel centers at +0.5."""
 
@@ -148,8 +147,6 @@ class ControlPoints:
     points: tuple[ControlPoint, ...] = ()
     crs: str = ""
     """Coordinate system, as the file names it."""
-    geographic: bool = False
-    """Whether positions are longitude and latitude in degrees (WGS84)."""
     source: str = ""
     """Path of the file, for people."""
     digest: str = ""

@@ -6,6 +6,7 @@ from click.testing import CliRunner
 from sfm_app.cli.options import parse_assignment
 from sfm_app.cli.program import main
 from sfm_app.errors import ConfigError, InputError
+from sfm_app.frame.control_points import read_control_points
 from sfm_app.photos.files import list_photos, resolve_file
 from sfm_app.settings import MOST_TOML_BYTES, Settings
 
@@ -83,3 +84,21 @@ def test_strange_names_in_a_list_are_left_out(tmp_path, line):
 def test_a_list_that_no_file_can_be(tmp_path):
     with pytest.raises(InputError, match="cannot read"):
         list_photos(tmp_path, tmp_path / "out", tmp_path / "a\0b")
+
+
+MARKS = b"""\n500000.1 4649000.2 320 10 20 a b.jpg p
+500010\t4649020\t321\t11\t22\tc.jpg\tq\n1;2;3;4;5;x y.JPG;n\n"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("header", [b"EPSG:32632", b"+proj=utm +zone=32 +datum=WGS84", b"WGS84 UTM 32N", b"local"])
+def test_damaged_control_points_are_read_or_refused(tmp_path, header):
+    path, found = tmp_path / "gcp_list.txt", []
+    for seed in range(60):
+        path.write_bytes(damaged(header + MARKS, seed, (*ANYTHING, *[text_values] * 12))[0])
+        try:
+            found.append(bool(read_control_points(path, ["a b.jpg", "c.jpg"])))
+        except InputError as err:
+            assert len(str(err)) < LONGEST
+            found.append(False)
+    assert 0 < sum(found) < len(found)

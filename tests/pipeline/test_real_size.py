@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 
 import sfm_app
 from benchmarks.synthetic.scenes import marker_sheet
+from sfm_app.frame.coordinates import LocalFrame, read_system
 from sfm_app.frame.markers import draw_pattern
 from sfm_app.geometry.poses import Similarity, umeyama
 from sfm_app.settings import Settings
@@ -70,7 +71,7 @@ def true_similarity(measured):
 
 
 def to_utm(place):
-    return UTM + np.array([place[0], -place[2], place[1]])
+    return LocalFrame(read_system("EPSG:32632"), UTM).positions(np.array([[place[0], -place[2], place[1]]]))[0]
 
 
 def assert_scale(found, true, within):
@@ -156,7 +157,7 @@ def test_control_points_give_size_and_place(measured, tmp_path):
     frame = Similarity(found["scale"], np.array(found["R"]), np.array(found["t"]))
     for name, pose in run.scene.cam_from_world.items():
         x, y, z = frame(camera_center(pose))
-        east_north_up = np.array([x, -z, y]) + found["offset"]
+        east_north_up = np.array([x, -z, y]) * [*2 * found["units_per_m"][:1], 1.0] + found["offset"]
         assert np.linalg.norm(east_north_up - to_utm(camera_center(measured.truth.cam_from_world[name]))) < 0.03
 
 
@@ -168,6 +169,35 @@ def test_a_wrong_control_point_is_named_and_left_out(measured, tmp_path):
     assert counts["control_points"]["wrong"]["p1"] == pytest.approx(0.23, abs=0.03)
     assert any("'p1' contradicts the others" in text for text in counts["problems"])
     assert_scale(read_scale(measured.out), true_similarity(measured).scale, within=0.005)
+
+
+def test_control_points_in_feet_give_the_same_size(measured, tmp_path):
+    lines = marks_file(measured, tmp_path / "meters.txt", GROUND[:5]).read_text().splitlines()
+    feet = LocalFrame(read_system("EPSG:2263"), np.array([980_000.0, 200_000.0, 100.0]))
+    ground = LocalFrame(read_system("EPSG:32632"), UTM)
+    rows = [line.split() for line in lines[1:]]
+    positions = feet.positions(ground(np.array([row[:3] for row in rows], np.float64)))
+    marks = [f"{x:.4f} {y:.4f} {z:.4f} {' '.join(row[3:])}" for (x, y, z), row in zip(positions, rows, strict=True)]
+    path = tmp_path / "feet.txt"
+    path.write_text("\n".join(["EPSG:2263", *marks]), encoding="utf-16")  # as PowerShell writes
+    run = again(measured, control_points=str(path))
+    assert_scale(read_scale(measured.out), true_similarity(measured).scale, within=0.007)
+    assert read_scale(measured.out)["crs"] == "EPSG:2263"
+    assert run.manifest["stages"]["scale"]["counts"]["problems"] == []
+
+
+def test_mistakes_in_the_control_file_are_named(measured, tmp_path):
+    rows = [line.split() for line in marks_file(measured, tmp_path / "gcp.txt", GROUND).read_text().splitlines()]
+    for name, change, says in (
+        ("swapped.txt", lambda x, y, z, u, v: (y, x, z, u, v), "x and y are swapped"),
+        ("shares.txt", lambda x, y, z, u, v: (x, y, z, float(u) / 480, float(v) / 320), "between 0 and 1"),
+    ):
+        lines = ["EPSG:32632", *(" ".join(map(str, [*change(*row[:5]), *row[5:]])) for row in rows[1:])]
+        (tmp_path / name).write_text("\n".join(lines), encoding="utf-8")
+        run = again(measured, control_points=str(tmp_path / name))
+        (problem,) = run.manifest["stages"]["scale"]["counts"]["problems"]
+        assert says in problem
+        assert read_scale(measured.out)["unit"] == "arbitrary"
 
 
 def test_markers_that_are_not_there_leave_the_unit_as_it_was(measured):

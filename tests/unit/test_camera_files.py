@@ -17,7 +17,9 @@ from sfm_app.camera.projection import RAY
 from sfm_app.camera_files import MODEL_IDS, read_given_cameras
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.errors import InputError
+from sfm_app.formats.scenes import transforms
 from sfm_app.types import Calibration, CameraModel, Intrinsics
+from sfm_app.types.scene import PerspectivePhoto
 
 WIDTH, HEIGHT = 1000, 800
 OPENCV = [900.0, 910.0, 510.0, 390.0, -0.1, 0.02, 0.001, -0.002]
@@ -148,10 +150,149 @@ def test_a_panorama_of_opensfm(tmp_path):
     assert (camera.projection, camera.width, camera.height) == ("equirectangular", 1000, 500)
 
 
+SIZE = {"image_width": WIDTH, "image_height": HEIGHT}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "dist_coeff",
+        "distCoef",
+        "dist_coefs",
+        "DistortionCoefficients",
+        "distortion-coefficient",
+        "dist",
+        "D",
+        "distCoeffs",
+    ],
+)
+def test_common_names_of_the_distortion_are_known(tmp_path, name):
+    values = SIZE | {"camera_matrix": K, name: [OPENCV[4:]], "distortion_model": "plumb_bob"}
+    assert same_rays(only(tmp_path / "cameras.json", json.dumps(values)), "OPENCV", OPENCV)
+
+
+def test_distortion_may_be_in_terms_of_its_own(tmp_path):
+    values = SIZE | {"camera_matrix": K, "k1": -0.1, "k2": 0.02, "p1": 0.001, "p2": -0.002}
+    assert same_rays(only(tmp_path / "cameras.json", json.dumps(values)), "OPENCV", OPENCV)
+
+
+def test_numbers_of_an_unknown_name_may_be_the_distortion_and_are_refused(tmp_path):
+    values = SIZE | {"camera_matrix": K, "coefs": OPENCV[4:]}
+    with pytest.raises(InputError, match=r"'coefs' beside the camera matrix may be its distortion"):
+        given(tmp_path / "cameras.json", json.dumps(values))
+    harmless = {"rvecs": [[1, 2, 3]] * 5, "rms": 0.3, "roi": [0, 0, 9, 9], "R": np.eye(3).tolist(), "P": [0.0] * 12}
+    assert same_rays(only(tmp_path / "a.json", json.dumps(SIZE | {"K": K} | harmless)), "PINHOLE", OPENCV[:4])
+
+
+def test_yaml_of_ros(tmp_path):
+    text = f"""image_width: {WIDTH}
+image_height: {HEIGHT}
+camera_name: narrow_stereo
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: {np.ravel(K).tolist()}
+distortion_model: {{}}
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: {{}}
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]
+"""
+    camera = only(tmp_path / "left.yaml", text.format("plumb_bob", [*OPENCV[4:], 0.0]))
+    assert (camera.width, camera.height) == (WIDTH, HEIGHT) and same_rays(camera, "OPENCV", OPENCV)
+    assert only(tmp_path / "wide.yaml", text.format("equidistant", FISHEYE[4:])).projection == "fisheye"
+
+
+def test_yaml_of_kalibr(tmp_path):
+    text = f"""cam0:
+  T_cam_imu:
+  - [0.0, 1.0, 0.0, 0.1]
+  camera_model: {{}}
+  distortion_coeffs: {OPENCV[4:]}
+  distortion_model: radtan
+  intrinsics: [900.0, 910.0, 509.5, 389.5]
+  resolution: [{WIDTH}, {HEIGHT}]
+cam1:
+  camera_model: pinhole
+  distortion_coeffs: {FISHEYE[4:]}
+  distortion_model: equidistant
+  intrinsics: [400.0, 410.0, 509.5, 389.5]
+  resolution: [{WIDTH}, {HEIGHT}]
+"""
+    cameras = given(tmp_path / "camchain.yaml", text.format("pinhole")).cameras
+    assert same_rays(cameras["cam0"], "OPENCV", OPENCV) and same_rays(cameras["cam1"], "OPENCV_FISHEYE", FISHEYE)
+    with pytest.raises(InputError, match="camera 'cam0': the camera model eucm is not supported"):
+        given(tmp_path / "camchain.yaml", text.format("eucm"))
+
+
+METASHAPE = (
+    "<calibration><projection>{kind}</projection><width>1000</width><height>800</height><f>910</f><cx>10</cx>"
+    "<cy>-10</cy><b1>-10</b1><k1>-0.1</k1><k2>0.02</k2><p1>-0.002</p1><p2>0.001</p2>{more}</calibration>"
+)
+"""The camera `OPENCV`: Metashape's p1 and p2 are OpenCV's p2 and p1."""
+
+
+def test_xml_of_metashape(tmp_path):
+    alone = '<?xml version="1.0" encoding="UTF-8"?>\n' + METASHAPE.format(kind="frame", more="<date>2026</date>")
+    assert same_rays(only(tmp_path / "a.xml", alone), "OPENCV", OPENCV)
+    inner = METASHAPE.format(kind="frame", more="").replace(
+        "<calibration>", '<calibration type="frame" class="adjusted">'
+    )
+    project = (
+        '<document version="2.0"><chunk><sensors><sensor id="0" label="X100" type="frame">'
+        f'<resolution width="1000" height="800"/>{inner}</sensor><sensor id="1" label="none"/></sensors></chunk>'
+        "</document>"
+    )
+    cameras = given(tmp_path / "b.xml", project).cameras
+    assert cameras.keys() == {"X100"} and same_rays(cameras["X100"], "OPENCV", OPENCV)
+    for kind, more in (("frame", "<b2>0.5</b2>"), ("frame", "<k4>0.5</k4>"), ("cylindrical", "")):
+        with pytest.raises(InputError, match="not supported"):
+            given(tmp_path / "c.xml", METASHAPE.format(kind=kind, more=more))
+
+
+def nerfstudio(**values):
+    keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+    return dict(zip(keys, OPENCV, strict=True)) | {"w": WIDTH, "h": HEIGHT, "camera_model": "OPENCV"} | values
+
+
+def test_transforms_of_nerfstudio(tmp_path):
+    frames = [{"file_path": f"./images/{name}.jpg", "transform_matrix": np.eye(4).tolist()} for name in "ab"]
+    assert same_rays(only(tmp_path / "transforms.json", json.dumps(nerfstudio(frames=frames))), "OPENCV", OPENCV)
+    own = [frames[0] | nerfstudio(), frames[1] | nerfstudio(fl_x=905.0)]
+    found = given(tmp_path / "transforms.json", json.dumps({"frames": own}))
+    assert [found.cameras[found.camera_name(photo)].K[0, 0] for photo in ("a.jpg", "images/b.jpg")] == [900.0, 905.0]
+    angle = {"camera_angle_x": 2 * np.arctan(500 / 900), "w": WIDTH, "h": HEIGHT, "frames": frames}
+    assert same_rays(only(tmp_path / "blender.json", json.dumps(angle)), "SIMPLE_PINHOLE", [900.0, 500.0, 400.0])
+    with pytest.raises(InputError, match="no width and height"):
+        given(tmp_path / "blender.json", json.dumps({"camera_angle_x": 0.7, "frames": []}))
+
+
+def test_our_own_export_for_nerfstudio_is_read(tmp_path):
+    Ks = {name: np.array([[f, 0, 509.0], [0, f, 391.0], [0, 0, 1]]) for name, f in (("a", 900.0), ("b", 950.0))}
+    photos = [PerspectivePhoto(f"{name}.jpg", K, np.eye(3, 4), WIDTH, HEIGHT, name) for name, K in Ks.items()]
+    found = given(tmp_path / "transforms.json", json.dumps(transforms(tuple(photos))))
+    assert [found.cameras[found.camera_name(photo.name)].K.tolist() for photo in photos] == [
+        photo.K.tolist() for photo in photos
+    ]
+
+
+@pytest.mark.parametrize("text", [
+    "a: &a [1, 1]\nb: &b [*a, *a]\ncamera_matrix: [*b, *b]",
+    '<!DOCTYPE x [<!ENTITY a "aaaa">]><calibration><f>&a;</f></calibration>',
+])  # fmt: skip
+def test_files_that_grow_while_they_are_read_are_refused(tmp_path, text):
+    with pytest.raises(InputError, match=r"repeats parts of itself|has declarations"):
+        given(tmp_path / "bomb", text)
+
+
 KEYS = st.sampled_from([
     "a", "K", "camera_matrix", "dist", "width", "height", "data", "projection_type", "focal", "focal_x", "k1",
     "cameras", "camera_of", "identifiable", "projection", "fisheye", "spread", "params", "model", "image_size",
-    "distortion",
+    "distortion", "dist_coeff", "intrinsics", "fl_x", "frames", "camera_angle_x", "k4", "w", "h", "cx",
 ])  # fmt: skip
 """Keys of all forms."""
 KNOWN = Calibration(
@@ -240,10 +381,10 @@ def test_bytes_of_any_kind_end_in_cameras_or_in_one_error(tmp_path_factory, data
         ('{"K": [[9, 0, 3], [0, 9, 2], [0, 0, 1]], "dist": [0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0]}', "thin prism"),
         ('{"K": [[9, 0, 3], [0, 9, 2], [0, 0, 1]], "width": 5}', "5 x 0 pixels"),
         ('{"cameras": {"a": {"K": 3}}, "camera_of": {}}', "no known form"),
-        ("%YAML:1.0\n---\n{[", "OpenCV cannot read it"),
+        ("%YAML:1.0\n---\n{[", "no valid YAML"),
         (b"\0\0\0\0", "not those of a COLMAP model"),
         (struct.pack("<QIiQQ", 1, 1, 7, 9, 9), "a model that is not supported"),
-        (b"\xff\xfe\x31", "neither text nor"),
+        (b"\xff\xfe\x31", "it is no text in UTF-8 or UTF-16"),
     ],
 )
 def test_what_is_no_calibration_says_why_and_which_forms_are_known(tmp_path, data, says):
@@ -251,6 +392,14 @@ def test_what_is_no_calibration_says_why_and_which_forms_are_known(tmp_path, dat
         given(tmp_path / "cameras", data)
     assert says in str(caught.value)
     assert "cameras.txt" in caught.value.hint and "OpenSfM" in caught.value.hint
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_text_of_powershell_is_read(tmp_path, encoding):
+    text = "1 SIMPLE_PINHOLE 1000 800 900 500 400\n"
+    assert only(tmp_path / "cameras.txt", text.encode(encoding)).K[0, 0] == 900.0
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 ä.jpg\n\n", encoding)
+    assert read_given_cameras(tmp_path).camera_of == {"ä.jpg": "1"}
 
 
 def test_missing_files_and_folders_without_cameras_are_named(tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sfm_app import files
-from sfm_app.files import MOST_BYTES, digest_files, fingerprint, is_below, load_arrays, replace_atomically
+from sfm_app.files import MOST_BYTES, digest_files, fingerprint, is_below, load_arrays, read_text, replace_atomically
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
@@ -18,6 +18,26 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
         raise RuntimeError
     assert target.read_text() == "old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["x.txt"]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_a_text_of_the_user_is_read(tmp_path, encoding):
+    (tmp_path / "x.txt").write_text("größe\n", encoding=encoding)
+    assert read_text(tmp_path / "x.txt", 100) == "größe\n"
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        ("größe".encode("latin-1"), "no text in UTF-8 or UTF-16"),
+        (b"\xff\xfe\x31", "no text in UTF-8 or UTF-16"),
+        (bytes(101), r"larger than 0\.0001 MB"),
+    ],
+)
+def test_what_is_no_text_says_why(tmp_path, data, says):
+    (tmp_path / "x.txt").write_bytes(data)
+    with pytest.raises(ValueError, match=says):
+        read_text(tmp_path / "x.txt", 100)
 
 
 def test_arrays_come_back(tmp_path):

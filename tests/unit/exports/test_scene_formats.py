@@ -15,6 +15,8 @@ from sfm_app.camera_files import read_given_cameras
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.formats.gltf import FLIP
 from sfm_app.geometry.poses import Similarity
+from sfm_app.products import write_photo_list
+from sfm_app.types import Photo, PhotoSet
 from tests.unit.colored_photos import colors_of
 
 EXACT_PX, RELATIVE = 1e-6, 1e-6
@@ -44,16 +46,17 @@ def check_picture(path, K, R, frame, used=None):
     assert np.mean(wrong) < 2.5 and np.quantile(wrong, 0.99) < 12
 
 
-@pytest.mark.parametrize("name", ["colmap", pytest.param("colmap-text", marks=pytest.mark.slow), "splat"])
+@pytest.mark.parametrize("name", ["colmap", pytest.param("colmap-text", marks=pytest.mark.slow), "splat", "openmvs"])
 @pytest.mark.parametrize("kinds", [("lens", "other"), ("pinhole",), ("fisheye",), ("panorama", "lens")], ids="+".join)
 def test_colmap_reads_photos_without_distortion(make_run, frame, name, kinds):
     run = make_run(*kinds, until="scene")
 
     folder = sfm_app.export_scene(run.out, name)
-    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    place = folder / ("sparse" if name == "openmvs" else "sparse/0")
+    model = pycolmap.Reconstruction(place)
 
     assert folder == run.out / "export" / name
-    assert (folder / "sparse/0" / f"images.{'txt' if name == 'colmap-text' else 'bin'}").exists()
+    assert (place / f"images.{'txt' if name == 'colmap-text' else 'bin'}").exists()
     truth = places(run.model, frame)
     shares = len(model.points3D) / len(truth)
     assert 0.9 < shares <= 1.0 and (shares == 1.0 or name == "splat" or "lens" in kinds)
@@ -216,7 +219,8 @@ def test_the_dense_cloud_is_read_from_ply_and_from_laz(make_run, frame):
     points = frame(np.stack([run.cloud[c] for c in "xyz"], axis=1).astype(np.float64))
 
     plain = trimesh.load(sfm_app.export_scene(run.out, "cloud-ply"))
-    laz = laspy.read(sfm_app.export_scene(run.out, "laz"))
+    laz, las = (laspy.read(sfm_app.export_scene(run.out, name)) for name in ("laz", "las"))
+    assert las.header.are_points_compressed is False and np.array_equal(las.xyz, laz.xyz)
 
     np.testing.assert_allclose(plain.vertices, points, rtol=RELATIVE, atol=1e-6 * frame.scale)
     colors = np.stack([run.cloud[c] for c in ("red", "green", "blue")], axis=1)
@@ -267,6 +271,17 @@ def test_bundler_sees_points_where_the_photos_do(make_run, frame, kinds):
             assert k1 == k2 == 0.0 and at[2] < 0
             errors.append(np.abs(-f * at[:2] / at[2] - x).max())
     assert len(errors) >= 200 and max(errors) < 1e-3
+
+
+@pytest.mark.slow
+def test_the_record_names_the_files_of_the_user(make_run):
+    run = make_run("lens", until="scene")
+    names = [*(image.name for image in run.model.images.values()), "lost.jpg"]
+    photos = tuple(Photo(name, 60, 40, "g", original=f"my {name}.heic") for name in names)
+    write_photo_list(PhotoSet(run.place.photos, photos), dict.fromkeys(names), run.place)
+    record = json.loads((sfm_app.export_scene(run.out, "colmap") / "export.json").read_text("utf-8"))
+    assert set(record["photo_of"].values()) == {photo.path for photo in photos[:-1]}
+    assert record["unregistered"] == {"my lost.jpg.heic": "no overlap"}
 
 
 @pytest.mark.slow

@@ -221,6 +221,22 @@ def test_the_target_is_named_as_people_name_files(finished, tmp_path, file_forma
     assert len(trimesh.load(found[0], force="mesh").faces) == 320
 
 
+@pytest.mark.parametrize("name", ["chair.mtl", "chair_0.jpg"])
+def test_files_of_the_user_beside_the_model_are_kept(finished, tmp_path, name):
+    (tmp_path / name).write_text("mine")
+    result = call(finished, "-o", tmp_path / "chair.obj")
+    assert (result.exit_code, f"{name} beside" in result.stderr) == (3, True)
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == [name]
+
+
+@pytest.mark.parametrize("target", ["my chair.obj", "st\u00fchle v1.gltf"])
+def test_a_model_is_exported_to_the_same_place_again(finished, tmp_path, target):
+    first = sfm_app.export_model(finished, target=tmp_path / target)
+    before = [path.read_bytes() for path in first]
+    assert len(first) > 1 and sfm_app.export_model(finished, target=tmp_path / target) == first
+    assert [path.read_bytes() for path in first] == before
+
+
 def test_a_run_without_a_mesh_says_what_is_missing_and_what_to_do(tmp_path):
     place = Workspace(tmp_path / "out")
     place.manifest.finish("scene", StageRecord("", 0.0), {})

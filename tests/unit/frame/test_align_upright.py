@@ -111,6 +111,17 @@ def test_with_gps_the_model_is_in_meters_and_knows_its_place(tmp_path):
         assert enu == pytest.approx(enu_m([matches.images[key].gps], origin)[0], abs=4), "up is only that of roll"
 
 
+def test_swapped_latitudes_and_longitudes_are_named_and_not_used(tmp_path):
+    def swapped(views):
+        true = true_positions(views)
+        return [GpsPosition(one.longitude_deg, one.latitude_deg, one.altitude_m) for one in true]
+
+    _, model, matches, run = scene(tmp_path, swapped)
+    entry = orient(model, matches, submit_cue_extraction([model], matches, run))
+    assert entry["gps"].startswith("not used: latitude and longitude are probably swapped")
+    assert entry["unit"] == "about the size of the scene"
+
+
 def test_the_manifest_says_why_up_is_up(tmp_path):
     _, model, matches, run = scene(tmp_path, lambda views: [None] * len(views.cam_from_world))
     looks = submit_cue_extraction([model], matches, run)

@@ -4,19 +4,27 @@ import numpy as np
 import pytest
 
 from sfm_app.errors import InputError
-from sfm_app.frame.control_points import ControlFit, agreeing_points, fit_control_points, read_control_points
+from sfm_app.frame.control_points import (
+    ControlFit,
+    agreeing_points,
+    find_mistake,
+    fit_control_points,
+    read_control_points,
+)
+from sfm_app.frame.coordinates import LocalFrame, read_system
+from sfm_app.frame.known_lengths import is_normalized, marks_in_pixels
 from sfm_app.frame.sighted_points import SightedPoint
 from sfm_app.geometry.poses import Similarity
 from sfm_app.synthetic.cameras import axis_rotation
-from sfm_app.types import ControlPoint, ControlPoints
+from sfm_app.types import ControlPoint, ControlPoints, GpsPosition, Photo, PhotoSet
 
 CRS = "EPSG:32632\n"
 
 
-def read(tmp_path, text):
+def read(tmp_path, text, files=()):
     path = tmp_path / "gcp_list.txt"
     path.write_text(text, encoding="utf-8")
-    return read_control_points(path)
+    return read_control_points(path, files)
 
 
 def test_marks_with_one_name_are_of_one_point(tmp_path):
@@ -24,7 +32,61 @@ def test_marks_with_one_name_are_of_one_point(tmp_path):
     assert [point.name for point in found.points] == ["left", "right"]
     assert found.points[0].position == (1.0, 2.0, 3.0)
     assert found.points[0].marks == {"a.jpg": (100.5, 200.0), "b.jpg": (110.0, 210.0)}
-    assert not found.geographic
+    assert found.crs == "EPSG:32632"
+
+
+FILES = ["in/My Photo 1.JPG", "IMG_7.jpg", "img_8.jpg", "img_8.xmp", "two/x.jpg", "three/x.jpg", "twin.jpg", "twin.png"]
+
+
+@pytest.mark.parametrize(
+    ("tail", "photo", "name"),
+    [
+        ("in/My Photo 1.JPG corner", "in/My Photo 1.JPG", "corner"),
+        ("My Photo 1.JPG corner", "in/My Photo 1.JPG", "corner"),
+        ("my photo 1.jpg  corner extra", "in/My Photo 1.JPG", "corner"),
+        ("My Photo 1 corner", "in/My Photo 1.JPG", "corner"),
+        ("my photo 1", "in/My Photo 1.JPG", "point 1"),
+        ("img_7.JPG p", "IMG_7.jpg", "p"),
+        ("IMG_8", "img_8.jpg", "point 1"),
+        ("C:\\photos\\IMG_7.jpg p", "IMG_7.jpg", "p"),
+        ("two/x.jpg p", "two/x.jpg", "p"),
+        ("twin.png p", "twin.png", "p"),
+    ],
+)
+def test_a_photo_is_found_by_what_people_write(tmp_path, tail, photo, name):
+    (found,) = read(tmp_path, CRS + f"1 2 3 100 200 {tail}\n", FILES).points
+    assert (list(found.marks), found.name) == ([photo], name)
+
+
+@pytest.mark.parametrize("line", ["1,2,3,100,200,my photo 1.jpg,corner,x", "1; 2; 3; 100; 200; My Photo 1; corner"])
+def test_other_dividers_are_read(tmp_path, line):
+    (found,) = read(tmp_path, CRS + line, FILES).points
+    assert (found.name, found.marks) == ("corner", {"in/My Photo 1.JPG": (100.0, 200.0)})
+
+
+@pytest.mark.parametrize(
+    ("tail", "says"),
+    [("x.jpg p", "line 3 may mean three/x.jpg or two/x.jpg"), ("twin p", "line 3 may mean twin.jpg or twin.png")],
+)
+def test_a_photo_that_may_be_two_is_refused_with_its_line(tmp_path, tail, says):
+    with pytest.raises(InputError, match=says):
+        read(tmp_path, CRS + f"\n1 2 3 100 200 {tail}\n", FILES)
+
+
+def test_marks_in_photos_of_another_folder_are_refused_and_some_are_not(tmp_path):
+    other, own = "1 2 3 100 200 DSC 1.jpg p\n", "1 2 3 100 200 IMG_7.jpg p\n"
+    with pytest.raises(InputError, match=r"line 2 names the photo 'DSC 1\.jpg', which the folder does not have"):
+        read(tmp_path, CRS + other, FILES)
+    assert set(read(tmp_path, CRS + other + own, FILES).points[0].marks) == {"DSC 1.jpg", "IMG_7.jpg"}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"])
+def test_files_of_powershell_are_read(tmp_path, encoding):
+    mark = {"utf-16-le": b"\xff\xfe", "utf-16-be": b"\xfe\xff"}.get(encoding, b"")
+    path = tmp_path / "gcp_list.txt"
+    path.write_bytes(mark + (CRS + "1 2 3 100 200 ä.jpg ö\r\n").encode(encoding))
+    (found,) = read_control_points(path).points
+    assert (found.name, list(found.marks)) == ("ö", ["ä.jpg"])
 
 
 def test_marks_without_a_name_are_of_one_point_where_the_position_is(tmp_path):
@@ -37,11 +99,6 @@ def test_photo_names_may_have_spaces_where_tabs_divide(tmp_path):
     assert set(found.points[0].marks) == {"my photo.jpg"}
 
 
-@pytest.mark.parametrize("crs", ["EPSG:4326", "+proj=longlat +datum=WGS84", "WGS84"])
-def test_longitude_and_latitude_are_known_as_such(tmp_path, crs):
-    assert read(tmp_path, f"{crs}\n8.5 47.4 400 10 20 a.jpg\n").geographic
-
-
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -51,9 +108,8 @@ def test_longitude_and_latitude_are_known_as_such(tmp_path, crs):
         (CRS + "1 2 3 4 5\n", "line 2 is malformed"),
         (CRS + "1 2 3 4 5 a.jpg\n1 2 x 4 5 b.jpg\n", "line 3 is malformed"),
         (CRS + "1 2 nan 4 5 a.jpg\n", "line 2 has a value out of range"),
-        ("EPSG:4326\n8 97 0 4 5 a.jpg\n", "line 2 has a value out of range"),
+        (CRS + "1 2 3 4 5 a.jpg\n7 8 9 1 2 a.jpg p p2\n1 2 3 4\n", "line 4 is malformed"),
         (CRS + "1 2 3 4 5 a.jpg p\n1 2 4 4 5 b.jpg p\n", "gives 'p' another position"),
-        ("+proj=lcc +units=us-ft\n1 2 3 4 5 a.jpg\n", "not in meters"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path, text, says):
@@ -84,7 +140,8 @@ def survey(rng, count, noise_m=0.01, wrong=(), miss_m=1.0):
     for k in wrong:
         step = rng.normal(size=3)
         targets[k] += miss_m * step / np.linalg.norm(step)
-    enu = np.column_stack([targets[:, 0], -targets[:, 2], targets[:, 1]]) + UTM
+    frame = LocalFrame(read_system("EPSG:32632"), UTM)
+    enu = frame.positions(np.column_stack([targets[:, 0], -targets[:, 2], targets[:, 1]]))
     points = tuple(ControlPoint(f"p{k}", tuple(row), {}) for k, row in enumerate(enu.tolist()))
     located = {f"p{k}": SightedPoint(place, np.eye(3) * 1e-8, (), ()) for k, place in enumerate(places)}
     return ControlPoints(points, "EPSG:32632"), located, places
@@ -95,9 +152,11 @@ def test_five_points_give_the_place_and_the_size():
     found = fit_control_points(given, located)
     assert isinstance(found, ControlFit)
     assert found.from_model.scale == pytest.approx(TRUE.scale, rel=1e-9)
-    moved = found.from_model(places)
-    east_north_up = np.column_stack([moved[:, 0], -moved[:, 2], moved[:, 1]]) + found.offset
-    assert np.allclose(east_north_up, [point.position for point in given.points], atol=1e-6)
+    x, y, z = found.from_model(places).T
+    units, heights = found.units_per_m
+    assert units == pytest.approx(0.9996, rel=1e-4) and heights == 1.0
+    east_north_up = np.column_stack([units * x, -units * z, heights * y]) + found.offset
+    assert np.allclose(east_north_up, [point.position for point in given.points], atol=1e-4)
     assert found.offset == tuple(np.round(found.offset))  # whole meters
     assert found.crs == "EPSG:32632"
 
@@ -142,13 +201,100 @@ def test_too_few_points_and_points_on_a_line_give_a_reason():
     assert "on a line" in fit_control_points(given, on_line)
 
 
-def test_longitude_and_latitude_become_meters():
-    positions = {"a": (8.0, 47.0, 400.0), "b": (8.001, 47.0, 400.0), "c": (8.0, 47.001, 400.0)}
-    points = tuple(ControlPoint(name, position, {}) for name, position in positions.items())
-    given = ControlPoints(points, "EPSG:4326", geographic=True)
-    places = {"a": (0, 0, 0), "b": (0.76057, 0, 0), "c": (0, 0, -1.11177)}
-    located = {name: SightedPoint(np.array(at, float), np.eye(3) * 1e-9, (), ()) for name, at in places.items()}
-    found = fit_control_points(given, located)
-    assert found.from_model.scale == pytest.approx(100.0, rel=2e-3)
-    assert np.allclose(found.from_model.R, np.eye(3), atol=2e-3)
-    assert "47.0" in found.crs
+def surveyed(crs="EPSG:32632", place=(9.7, 48.1), count=8, noise_m=0.01, flat=False, seed=0):
+    """Control points of a scene of 100 m in a system, and their places in an upright model."""
+    rng = np.random.default_rng(seed)
+    enu = rng.uniform(-1, 1, size=(count, 3)) * [50.0, 40.0, 0.0 if flat else 12.0]
+    gps, system = read_system("EPSG:4979"), read_system(crs)
+    measured = LocalFrame(gps, np.array([*place, 300.0])).positions(enu + noise_m * rng.normal(size=enu.shape))
+    positions = system.positions(gps.geocentric_m(measured))
+    places = np.column_stack([enu[:, 0], enu[:, 2], -enu[:, 1]]) @ axis_rotation(np.array([0.0, 1.0, 0.0]), 70.0) / 12.0
+    located = {f"p{k}": SightedPoint(x, np.eye(3) * 1e-7, (), ()) for k, x in enumerate(places)}
+    return positions, located
+
+
+def points_at(positions, crs):
+    points = (ControlPoint(f"p{k}", tuple(row), {}) for k, row in enumerate(np.asarray(positions).tolist()))
+    return ControlPoints(tuple(points), crs)
+
+
+HERE = [GpsPosition(48.1, 9.7, 310.0), GpsPosition(48.1001, 9.7, None)]
+SWAPPED = [1, 0, 2]
+
+
+@pytest.mark.parametrize("flat", [False, True])
+@pytest.mark.parametrize(
+    ("crs", "says"),
+    [
+        ("EPSG:4326", "latitude and longitude are swapped"),
+        ("EPSG:4258", "latitude and longitude are swapped"),
+        ("EPSG:32632", "x and y are swapped"),
+        ("+proj=utm +zone=32 +datum=WGS84", "x and y are swapped"),
+        ("EPSG:31467", "x and y are swapped"),
+    ],
+)
+def test_swapped_coordinates_are_named_and_not_used(crs, says, flat):
+    positions, located = surveyed(crs, flat=flat)
+    text, unusable = find_mistake(points_at(positions[:, SWAPPED], crs), located, [])
+    assert says in text and unusable
+    assert "if so, they miss by" in text
+    assert find_mistake(points_at(positions, crs), located, []) == ("", False)
+
+
+def test_swapped_axes_of_ones_own_are_named():
+    positions, located = surveyed("EPSG:32632")
+    own = positions - positions.mean(axis=0)
+    assert find_mistake(points_at(own, "local"), located, HERE) == ("", False)
+    text, unusable = find_mistake(points_at(own[:, SWAPPED], "local"), located, HERE)
+    assert "x and y are swapped" in text and unusable
+
+
+@pytest.mark.parametrize(
+    ("crs", "wrong", "zone"),
+    [
+        ("EPSG:32632", "EPSG:32633", 32),
+        ("EPSG:25832", "EPSG:25831", 32),
+        ("+proj=utm +zone=32 +datum=WGS84", "+proj=utm +zone=33 +datum=WGS84", 32),
+        ("WGS84 UTM 32N", "WGS84 UTM 33N", 32),
+    ],
+)
+def test_a_wrong_zone_is_named_by_the_gps_of_the_photos(crs, wrong, zone):
+    positions, located = surveyed(crs)
+    text, unusable = find_mistake(points_at(positions, wrong), located, HERE)
+    assert f"the zone is {zone}" in text and "from the GPS positions of the photos" in text
+    assert not unusable, "the size is right"
+    assert find_mistake(points_at(positions, crs), located, HERE) == ("", False)
+
+
+def test_heights_in_meters_beside_feet_are_named():
+    positions, located = surveyed("EPSG:2263", (-73.9, 40.7))
+    assert find_mistake(points_at(positions, "EPSG:2263"), located, []) == ("", False)
+    text, unusable = find_mistake(points_at(positions * [1.0, 1.0, 0.3048], "EPSG:2263"), located, [])
+    assert "heights are in meters" in text and unusable
+
+
+def test_points_that_fit_badly_without_a_known_mistake_are_named():
+    positions, located = surveyed(noise_m=5.0)
+    text, unusable = find_mistake(points_at(positions, "EPSG:32632"), located, HERE)
+    assert "miss their places by" in text and "check the coordinate system" in text and not unusable
+    text, _ = find_mistake(points_at(surveyed(noise_m=0.01)[0], "EPSG:2154"), located, [])
+    assert "degrees outside of the area of EPSG:2154" in text
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:32632", "local"])
+def test_sound_points_with_a_wrong_one_raise_no_alarm(crs):
+    for seed in range(30):
+        positions, located = surveyed("EPSG:32632" if crs == "local" else crs, count=6 + seed % 4, seed=seed)
+        if crs != "EPSG:4326" and seed % 2:
+            positions[2] += [3.0, -2.0, 4.0]
+        assert find_mistake(points_at(positions, crs), located, HERE) == ("", False)
+
+
+def test_marks_as_shares_become_pixels(tmp_path):
+    photos = (Photo("a.jpg", 400, 300, "g"), Photo("b.jpg", 400, 300, "g", turn_deg=90))
+    marks = {"a.jpg": (0.25, 0.5), "b.jpg": (0.25, 0.5)}
+    given = ControlPoints((ControlPoint("p", (0.0, 0.0, 0.0), marks),), "local")
+    assert is_normalized(given)
+    scaled = marks_in_pixels(PhotoSet(tmp_path, photos), given)
+    assert scaled.points[0].marks == {"a.jpg": (100.0, 150.0), "b.jpg": (75.0, 200.0)}
+    assert not is_normalized(scaled)

@@ -114,3 +114,30 @@ def test_cameras_too_near_each_other_for_numbers_have_no_place(up_is_sure):
     centers, positions, up, _ = walk(12, 60.0, 3.0)
     positions = [replace(position, altitude_m=180.0 + k) for k, position in enumerate(positions)]
     assert not georeference(1e-200 * centers, positions, up, up_is_sure=up_is_sure)
+
+
+def swap(positions):
+    return [replace(one, latitude_deg=one.longitude_deg, longitude_deg=one.latitude_deg) for one in positions]
+
+
+@pytest.mark.parametrize("radius_m", [15.0, 60.0])
+@pytest.mark.parametrize("up_is_sure", [True, False])
+def test_swapped_latitude_and_longitude_are_named(radius_m, up_is_sure):
+    centers, positions, up, _ = walk(12, radius_m, 0.3)
+    found = georeference(centers, swap(positions), up, up_is_sure=up_is_sure)
+    assert not found and "latitude and longitude are probably swapped" in found.reason
+    assert georeference(centers, positions, up, up_is_sure=up_is_sure)
+
+
+@pytest.mark.parametrize("place", [(10.0, 80.0), (48.2, 16.37), (45.0, 44.0), (-33.9, 18.4)])
+def test_sound_positions_raise_no_alarm_also_on_a_line(place):
+    origin = GpsPosition(*place, 100.0)
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        centers, _, up, enu = walk(12, 60.0, 0.0, seed)
+        flatten = [1.0, 0.02, 1.0] if seed % 2 else [1.0, 1.0, 1.0]
+        R = np.linalg.lstsq(enu - enu.mean(axis=0), centers - centers.mean(axis=0), rcond=None)[0]
+        enu = (enu - enu.mean(axis=0)) * flatten
+        noisy = enu + rng.normal(scale=3.0, size=enu.shape)
+        found = georeference(enu @ R, [position_from_enu(row, origin) for row in noisy], up)
+        assert found or "swapped" not in found.reason

@@ -33,9 +33,10 @@ def test_the_output_folder_is_left_out(folder):
     assert list_files(folder, folder / "out") == ["a.jpg", "b.jpg", "inner/a.jpg"]
 
 
-def test_a_list_names_the_photos(folder, out, tmp_path):
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_a_list_names_the_photos(folder, out, tmp_path, encoding):
     names = tmp_path / "list.txt"
-    names.write_text("\ufeffinner/a.jpg\r\n\nb.jpg\nb.jpg\nmissing.jpg\n../secret.jpg\n/etc/passwd\n", "utf-8")
+    names.write_text("inner/a.jpg\r\n\nb.jpg\nb.jpg\nmissing.jpg\n../secret.jpg\n/etc/passwd\n", encoding)
     found = {name: resolve_file(folder, name) for name in list_photos(folder, out, names)}
     assert [name for name, place in found.items() if not isinstance(place, str)] == ["b.jpg", "inner/a.jpg"]
     assert found["missing.jpg"] == "missing"

@@ -108,6 +108,14 @@ def test_names_that_colmap_or_a_terminal_cannot_have_are_replaced_and_the_origin
     assert (photo.name, photo.path) == (stored, path)
 
 
+@pytest.mark.parametrize("letter", ["a", "\u00fc", "\U0001f600"])
+def test_long_names_leave_room_for_what_later_stages_append(letter):
+    stem = letter * (251 // len(letter.encode()))
+    first, second = named(f"sub/{stem}.jpg", f"sub/{stem[:-1]}b.jpg")
+    assert first != second and first.startswith(f"sub/{letter}{letter}") and first.endswith(f"{letter}.jpg")
+    assert all(190 < len(name.encode()) <= 210 for name in (first, second))
+
+
 def test_lossless_photos_become_png():
     assert named("a.tif", "b.bmp", lossy=False) == ["a.tif.png", "b.bmp.png"]
 

@@ -2,12 +2,15 @@
 
 import json
 import math
+import os
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
+import sfm_app
 from sfm_app.report.findings import (
     ALL_PIXELS,
     LARGEST_PX,
@@ -68,6 +71,21 @@ def test_settings_that_were_changed_are_listed_with_their_defaults():
     given = Settings.from_mapping({"seed": 3, "mesh": {"faces": 1000}}).model_dump()
     contents = SimpleNamespace(manifest={"settings": given})
     assert changed_settings(contents) == [("mesh.faces", "1000", str(Settings().mesh.faces)), ("seed", "3", "0")]
+
+
+def test_an_output_folder_whose_name_is_no_text_has_a_report(tmp_path):
+    out = tmp_path / os.fsdecode(b"o\xff")
+    try:
+        out.mkdir()
+    except OSError:
+        pytest.skip("names of files are text here")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for seed in range(2):
+        pixels = np.random.default_rng(seed).integers(0, 255, (96, 128, 3), np.uint8)
+        Image.fromarray(pixels).save(photos / f"{seed}.png")
+    sfm_app.reconstruct(photos, out, last="photos")
+    assert "2 usable photos" in (out / "report.html").read_text(encoding="utf-8")
 
 
 def test_nothing_is_claimed_of_a_run_without_a_stage():

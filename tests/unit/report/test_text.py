@@ -46,8 +46,8 @@ def test_distortion_widens_the_field():
 
 
 def test_a_guess_says_what_it_is_and_why():
-    texts = camera_texts(camera(identifiable=False, method="exif", reason="an orbit"))
-    assert "these photos do not determine it (an orbit): from EXIF" in texts
+    texts = camera_texts(camera(identifiable=False, method="claim", reason="an orbit"))
+    assert "these photos do not determine it (an orbit): a claim" in texts
 
 
 def test_lens_and_assumptions_are_empty_without_content():
@@ -147,6 +147,8 @@ def test_every_hypothesis_has_words(name):
 def test_meters_are_named():
     text, _ = describe(orientation=COUNTS["orientation"] | {"unit": "meter"})
     assert "in meters by GPS" in text
+    swapped = COUNTS["orientation"] | {"gps": "not used: latitude and longitude are probably swapped"}
+    assert "beware: GPS is not used: latitude and longitude are probably swapped" in describe(orientation=swapped)[0]
 
 
 def test_a_model_that_may_stand_the_wrong_way_up_comes_with_a_remedy():

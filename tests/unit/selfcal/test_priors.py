@@ -152,6 +152,14 @@ def test_a_wrong_claim_does_not_move_the_answer(shots, claim):
     assert 0 < abs(found.K[0, 0] - 1000) < 3 * found.spread["fx"] < 20
 
 
+def test_a_wrong_center_is_rejected_alone(shots):
+    made = shots(6, 3)
+    claims = [CameraPrior("a net", 1000.0, 10.0, center, 12.0) for center in ((430.0, 375.0), (501.0, 374.0))]
+    plain, wrong, right = (calibrate(replace(made.pairs, prior=prior), OPTIONS, 0) for prior in (None, *claims))
+    assert np.abs(wrong.K - plain.K).max() < np.abs(wrong.K[0, 2] - 430.0) / 10
+    assert right.spread["cx"] < 1.01 * plain.spread["cx"] and abs(right.K[0, 2] - 500.0) < 3 * right.spread["cx"]
+
+
 def test_a_right_claim_helps_weak_pairs(shots):
     spreads = []
     for prior in (None, CameraPrior("a net", 1005.0, 50.0)):

@@ -1,0 +1,187 @@
+"""Coordinate systems of the Earth, by PROJ, and local frames in meters."""
+
+import re
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from sfm_app.errors import NumericalError
+from sfm_app.types.arrays import FloatArray
+
+GPS_SYSTEM = "EPSG:4979"
+"""WGS84: longitude and latitude in degrees, height in meters."""
+OPENDRONEMAP_UTM = re.compile(r"WGS ?84 */? *UTM *(?:zone *)?(\d{1,2}) *([NS])", re.IGNORECASE)
+LOCAL = 'ENGCRS["local",EDATUM["local"],CS[Cartesian,3],AXIS["x",east],AXIS["y",north],AXIS["z",up],LENGTHUNIT["m",1]]'
+"""System of the word `local`: meters along axes of the user's own."""
+EARTH_M = (6.3e6, 6.45e6)
+"""Distances from the center of the Earth between which all ground lies, in meters. The poles are at 6.357e6."""
+FLAT_M = 1e8
+"""Largest coordinate along the user's own axes, in meters. Chosen by hand."""
+
+
+class CoordinateSystem:
+    """A system of positions (N, 3) in its own units: x east or longitude, y north or latitude, z up.
+
+    Heights count as above the ellipsoid, since grids of the geoid may be absent: lengths change by 1e-5. They have
+    the system's unit of height, else its unit of length, else meters.
+    """
+
+    def __init__(self, text: str, crs: Any) -> None:
+        """`text` is the name for people, `crs` that of pyproj."""
+        from pyproj import Transformer
+
+        parts = [_unbound(part) for part in crs.sub_crs_list] if crs.is_compound else [crs]
+        self.crs, axes = parts[0], parts[0].axis_info
+        self.is_flat: bool = self.crs.is_engineering
+        if not (self.is_flat or self.crs.is_geographic or self.crs.is_projected or self.crs.is_geocentric):
+            raise ValueError(f"'{crs.name}' has no horizontal coordinates")
+        self.name: str = crs.name if "[" in text or "{" in text else text
+        self.title: str = text if crs.name == "unknown" else crs.name
+        heights = parts[1].axis_info[0] if len(parts) > 1 else axes[2] if len(axes) > 2 else None
+        self.has_heights, self.unit = heights is not None, axes[0].unit_conversion_factor
+        """Meters per unit of x; radians in a geographic system."""
+        self.z_m = 1.0 if self.crs.is_geographic else self.unit
+        """Meters per unit of z; negative for depths."""
+        if heights is not None:
+            self.z_m = heights.unit_conversion_factor * (-1.0 if heights.direction == "down" else 1.0)
+        self._linear = (self.unit, self.unit, self.z_m) if self.is_flat or self.crs.is_geocentric else None
+        if not self.is_flat:
+            datum, shape = self.crs.geodetic_crs, self.crs.ellipsoid
+            self.ellipsoid = f"+a={shape.semi_major_metre!r} +b={shape.semi_minor_metre!r}"
+            self._cart = Transformer.from_pipeline(f"+proj=cart {self.ellipsoid}")
+            self._to_datum = Transformer.from_crs(self.crs, datum, always_xy=True)
+            self._angle = datum.axis_info[0].unit_conversion_factor
+            self._meridian = datum.prime_meridian.longitude * datum.prime_meridian.unit_conversion_factor
+
+    def geocentric_m(self, positions: FloatArray) -> FloatArray:
+        """Return points (N, 3) from the center of the ellipsoid; NaN far from the ground. A flat system has its own."""
+        if self._linear:
+            points = np.asarray(positions * self._linear)
+        else:
+            x, y, z = positions.T
+            longitude, latitude = (self._angle * value for value in self._to_datum.transform(x, y))
+            latitude = np.where(np.abs(latitude) <= np.pi / 2, latitude, np.nan)
+            points = np.column_stack(
+                self._cart.transform(longitude + self._meridian, latitude, z * self.z_m, radians=True)
+            )
+        low, high = (0.0, FLAT_M) if self.is_flat else EARTH_M
+        with np.errstate(over="ignore"):
+            distances = np.linalg.norm(points, axis=1)
+        on_ground = (distances >= low) & (distances <= high)
+        return np.where(on_ground[:, None], points, np.nan)
+
+    def positions(self, points: FloatArray) -> FloatArray:
+        """Return points (N, 3) from `geocentric_m` as positions."""
+        if self._linear:
+            return np.asarray(points / self._linear)
+        longitude, latitude, height = self.geodetic(points).T
+        angles = (longitude - self._meridian) / self._angle, latitude / self._angle
+        return np.column_stack([*self._to_datum.transform(*angles, direction="INVERSE"), height / self.z_m])
+
+    def geodetic(self, points: FloatArray) -> FloatArray:
+        """Return longitude from Greenwich, latitude, both in radians, and height in meters of geocentric points."""
+        x, y, z = points.T
+        return np.column_stack(self._cart.transform(x, y, z, radians=True, direction="INVERSE"))
+
+    def degrees_outside(self, point: FloatArray) -> float:
+        """Return how far a geocentric point (3,) lies outside of the area for which the system is made; 0 inside."""
+        area = self.crs.area_of_use
+        if area is None or self.is_flat:
+            return 0.0
+        longitude, latitude, _ = np.degrees(self.geodetic(point[None])[0])
+        width = (area.east - area.west) % 360.0 or 360.0
+        beyond = (longitude - area.west) % 360.0 - width
+        return float(max(min(beyond, 360.0 - width - beyond), area.south - latitude, latitude - area.north, 0.0))
+
+
+class LocalFrame:
+    """A Cartesian frame in meters: x east, y north and z up of an origin, on the tangent plane of the ellipsoid.
+
+    Lengths are those on the ground, also where a projection distorts them. In a conformal projection, x follows its
+    grid instead of the east.
+    """
+
+    def __init__(self, system: CoordinateSystem, origin: FloatArray) -> None:
+        """`origin` is a position (3,); a NumericalError says that it is not on Earth."""
+        from pyproj import Transformer
+
+        self.system, self.origin, self.center = system, origin, system.geocentric_m(origin[None])[0]
+        if not np.isfinite(self.center).all():
+            raise NumericalError("the coordinates are not on Earth")
+        self.has_grid, self.units_per_m = system.is_flat, (1.0 / system.unit, 1.0 / system.z_m)
+        """Whether x and y follow a grid, and its units per meter along them and along z."""
+        self._turn = np.eye(3)
+        if not system.is_flat:
+            X, Y, Z = self.center.tolist()
+            pipeline = f"+proj=topocentric {system.ellipsoid} +X_0={X!r} +Y_0={Y!r} +Z_0={Z!r}"
+            self._topocentric = Transformer.from_pipeline(pipeline)
+        if system.crs.is_projected:
+            self._follow_grid()
+
+    @classmethod
+    def around(cls, system: CoordinateSystem, positions: FloatArray) -> "LocalFrame":
+        """Return the frame at the median of positions (N, 3), rounded to whole units of a grid."""
+        middle = system.positions(np.median(system.geocentric_m(positions), axis=0)[None])[0]
+        return cls(system, np.round(middle) if system.crs.is_projected or system.is_flat else middle)
+
+    def __call__(self, positions: FloatArray) -> FloatArray:
+        """Return positions (N, 3) of the system in the frame."""
+        points = self.system.geocentric_m(positions)
+        if self.system.is_flat:
+            return np.asarray(points - self.center)
+        return np.column_stack(self._topocentric.transform(*points.T)) @ self._turn.T
+
+    def positions(self, points: FloatArray) -> FloatArray:
+        """Return points (N, 3) of the frame as positions in the system."""
+        if self.system.is_flat:
+            return self.system.positions(points + self.center)
+        x, y, z = (points @ self._turn).T
+        return self.system.positions(np.column_stack(self._topocentric.transform(x, y, z, direction="INVERSE")))
+
+    def describe(self) -> str:
+        """Return the grid, or the place of the origin, for people."""
+        if self.has_grid:
+            return self.system.name
+        longitude, latitude, height = self.system.geodetic(self.center[None])[0]
+        place = f"{np.degrees(latitude):.8f}, {np.degrees(longitude):.8f}, {height:.3f}"
+        return f"meters east, north and up of {place} ({self.system.name})"
+
+    def _follow_grid(self) -> None:
+        """Turn x to the grid if that is conformal here to a percent, as Web Mercator is."""
+        step = 10.0  # in the grid's units: the Earth is flat over it to 1e-6
+        (xx, xy, _), (yx, yy, _) = self(self.origin + step * np.eye(3)[:2]) / step
+        along = complex(xx + yy, xy - yx) / 2.0
+        if abs(complex(xx, xy) - along) < 0.01 * abs(along):
+            self.has_grid, self.units_per_m = True, (1.0 / abs(along), self.units_per_m[1])
+            c = along.conjugate() / abs(along)
+            self._turn = np.array([[c.real, -c.imag, 0.0], [c.imag, c.real, 0.0], [0.0, 0.0, 1.0]])
+
+
+@lru_cache(maxsize=64)
+def read_system(text: str) -> CoordinateSystem:
+    """Read a code, a PROJ string, WKT, a name or `local`; a ValueError says that PROJ knows no such system."""
+    import pyproj  # takes a third of a second to load
+    from pyproj.network import set_network_enabled
+
+    set_network_enabled(False)
+    code = re.sub(r"^\+init=(\S+).*", r"\1", LOCAL if text.casefold() == "local" else text)
+    code = OPENDRONEMAP_UTM.sub(r"WGS 84 / UTM zone \1\2", code)
+    unknown = f"'{text[:60]}' is no coordinate system that PROJ knows"
+    try:
+        crs = pyproj.CRS.from_user_input(code)
+        # PROJ also takes names that merely resemble its own
+        if not re.search(r"[:=\[{]|^\d+$", code) and _letters(crs.name) != _letters(code):
+            raise ValueError(f"{unknown}; the nearest name is '{crs.name}'")
+        return CoordinateSystem(text, _unbound(crs))
+    except (pyproj.exceptions.ProjError, RecursionError):  # JSON may be nested
+        raise ValueError(unknown) from None
+
+
+def _unbound(crs: Any) -> Any:
+    """Return a system without its transformation to another datum, which does not change lengths."""
+    return _unbound(crs.source_crs) if crs.is_bound else crs
+
+
+def _letters(name: str) -> str:
+    return re.sub(r"[\W_]", "", name).casefold()
