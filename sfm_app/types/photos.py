@@ -120,12 +120,12 @@ class Photo:
     """The picture inside bars of one color, in the sensor's orientation; None without bars."""
     mask: str = ""
     """Path of its mask inside the folder of masks; empty where it has none."""
-    cut_out: bool = False
-    """True where pixels of the file are transparent, which masks them."""
     projection: str = "perspective"
     """"equirectangular" for a panorama, "perspective" for every other photo, also for fisheyes: matches show those."""
     time_s: float | None = None
     """Seconds from the start of its video; None for photos."""
+    cut_out: bool = False
+    """True where pixels of the file are transparent, which masks them."""
 
     @property
     def path(self) -> str:

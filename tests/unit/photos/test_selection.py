@@ -11,7 +11,7 @@ from scipy.ndimage import uniform_filter1d
 from sfm_app.photos.probe import read_photo
 from sfm_app.photos.selection import PhotoStats, drop_duplicates, drop_unusable, measure_photo, read_stats, write_stats
 from sfm_app.settings import PhotoSettings
-from sfm_app.types import GpsPosition, Photo
+from sfm_app.types import CameraPrior, GpsPosition, Photo
 
 
 def boxes(seed=0, shift=0):
@@ -155,8 +155,8 @@ def test_photos_that_may_be_of_use_stay(kind):
 OPTIONS = PhotoSettings()
 DIGESTS = {"a.jpg": "1", "sub/b.jpg": "2"}
 FULL = Photo(
-    "sub/b.jpg", 640, 480, "camera", 700.5, True, GpsPosition(47.1, 8.2, None), "sub/B.webp", False, 90, ("scaled",),
-    (10, 0, 600, 480), "b.png", "equirectangular", 1.25,
+    "sub/b.jpg", 640, 480, "camera", CameraPrior("EXIF", 700.5, 28.0), True, GpsPosition(47.1, 8.2, None), "sub/B.webp", False, 90, ("scaled",),
+    (10, 0, 600, 480), "b.png", "equirectangular", 1.25, True,
 )  # fmt: skip
 
 
