@@ -155,7 +155,8 @@ def test_photos_that_may_be_of_use_stay(kind):
 OPTIONS = PhotoSettings()
 DIGESTS = {"a.jpg": "1", "sub/b.jpg": "2"}
 FULL = Photo(
-    "sub/b.jpg", 640, 480, "camera", CameraPrior("EXIF", 700.5, 28.0), True, GpsPosition(47.1, 8.2, None), "sub/B.webp", False, 90, ("scaled",),
+    "sub/b.jpg", 640, 480, "camera", CameraPrior("EXIF", 700.5, 28.0), True, GpsPosition(47.1, 8.2, None),
+    "sub/B.webp", False, 90, ("scaled",),
     (10, 0, 600, 480), "b.png", "equirectangular", 1.25, True,
 )  # fmt: skip
 
