@@ -33,7 +33,8 @@ learned: $(INSTALLED)
 faults: $(INSTALLED)
 	SFM_APP_FAULTS=1 $(BIN)/python -m pytest -n $(JOBS) tests/faults
 
-# rivals that registries have, beside ours on the same pixels, for two hours: DATA has pairs/*.npz, NAME/images and NAME/cameras.json
+# rivals that registries have, beside ours on the same pixels, for two hours and a half: DATA has pairs/*.npz, NAME/images and NAME/cameras.json;
+# pyarchinit-photogrammetry needs Python 3.10 to 3.12, and an environment of its own, for its Open3D is not ours
 bench-rivals: $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	$(BIN)/python -m benchmarks.cameras $(DATA) --cache $(CACHE) --results $(CACHE) --told 10 5 0 --openmvg \
@@ -41,6 +42,10 @@ bench-rivals: $(INSTALLED)
 	$(BIN)/python -m benchmarks.fundamental --real $(DATA) --facades 5 --cache $(CACHE) --results $(CACHE) \
 	    --methods lev-ransac --rivals 'OpenCV MAGSAC++' SupeRANSAC openmvg-rs
 	$(BIN)/python -m benchmarks.selfcal --photos $(DATA) --cache $(CACHE) --results $(CACHE)
+	$(PYTHON) -m venv $(CACHE)/pyarchinit
+	$(CACHE)/pyarchinit/bin/python -m pip install --quiet --disable-pip-version-check 'pyarchinit-photogrammetry[fast,mesh]==1.6.0'
+	$(BIN)/python -m benchmarks.surface.rivals $(DATA) --cache $(CACHE) --results $(CACHE) \
+	    --pyarchinit $(CACHE)/pyarchinit/bin/python
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
