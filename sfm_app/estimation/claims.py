@@ -50,10 +50,13 @@ class Claim:
         claimed, found, sigma = self.prior.focal_px, self.found.focal_px, self.found.spread.get("fx", 0.0)
         off, text = abs(found - claimed), ""
         if off > CONTRADICTED * self.prior.focal_deviation_px and off > CHECKS.sigmas * sigma:
-            # a later crop leaves the focal in pixels as it was, while EXIF's shrinks with the longer side
-            cause = "they were cropped or zoomed" if found > claimed else "they were joined, or taken otherwise"
             deviation = f" +- {sigma:.3g}" if sigma > 0.0 else ""
-            text = f"{self.prior.source} says {claimed:.0f} px, the photos say {found:.0f}{deviation}: {cause}"
+            text = f"{self.prior.source} says {claimed:.0f} px, the photos say {found:.0f}{deviation} px"
+            if self.prior.source == EXIF:
+                # a later crop leaves the focal in pixels as it was, while EXIF's shrinks with the longer side
+                text += (
+                    f": they were {'cropped or zoomed' if found > claimed else 'joined, or taken through another lens'}"
+                )
         size = self.found.width, self.found.height
         centers = center_contradictions(claimed_calibration(self.prior, size, "", {}), self.found)
         return "; ".join(filter(None, (text, *(one.text for one in centers if self.prior.center_px is not None))))

@@ -90,7 +90,7 @@ def test_only_contradicted_claims_are_said_and_all_are_recorded(tmp_path):
         {"a": Claim(exif(1200.0), 3, camera()), "b": Claim(exif(900.0), 2, camera(905.0, 5.0)), "c": None}, run
     )
     assert run.progress.lines == [
-        "the photos a: EXIF says 1200 px, the photos say 1850 +- 20: they were cropped or zoomed"
+        "the photos a: EXIF says 1200 px, the photos say 1850 +- 20 px: they were cropped or zoomed"
     ]
     recorded = run.statistics["camera_claims"]
     assert [recorded[name]["contradicted"] for name in ("a", "b")] == [True, False] and "c" not in recorded
