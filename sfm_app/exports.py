@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
-from urllib.parse import unquote_to_bytes
 
 import numpy as np
 from numpy.typing import NDArray
@@ -293,7 +292,7 @@ def check_parts(main: Path, parts: Sequence[str]) -> None:
     The user has only named the main file. An earlier one names its parts.
     """
     present = [path for name in parts if (path := main.with_name(name)).exists()]
-    named = unquote_to_bytes(b"".join(_beginning(path) for path in (main, *present) if path.is_file()))
+    named = b"".join(_beginning(path) for path in (main, *present) if path.is_file())
     foreign = [path.name for path in present if path.name.encode() not in named]
     if foreign:
         raise InputError(

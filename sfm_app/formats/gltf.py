@@ -13,7 +13,6 @@ import re
 import struct
 from collections.abc import Mapping
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,8 +110,8 @@ def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
 
 def write_gltf(model: Model, name: str) -> Mapping[str, bytes]:
     """Write the same as JSON with its arrays and pictures in a file beside it."""
-    glb, arrays = _build(model, name), re.sub(r"\s", "_", f"{name}.bin")
-    return {f"{name}.gltf": glb.to_text(uri=quote(arrays)), arrays: glb.buffer}
+    glb, arrays = _build(model, name), re.sub(r"[\s%#?]", "_", f"{name}.bin")  # an address without escapes
+    return {f"{name}.gltf": glb.to_text(uri=arrays), arrays: glb.buffer}
 
 
 def _build(model: Model, name: str) -> Glb:

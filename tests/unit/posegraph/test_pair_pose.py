@@ -76,8 +76,8 @@ def test_where_a_camera_is_a_guess_the_inliers_of_F_stay(two_views):
     assert np.array_equal(pose.inliers, fit_of(views).inliers)
 
 
-def test_a_focal_from_exif_is_trusted(two_views):
-    claimed = two_views.camera(method="exif", identifiable=False)
+def test_a_claimed_camera_is_trusted(two_views):
+    claimed = two_views.camera(method="claim", identifiable=False)
     assert two_views().pair((claimed, claimed)).trusted
     assert estimate_pose(two_views().pair((claimed, claimed)), fit_of(two_views())).kind == "calibrated"
 

@@ -14,7 +14,7 @@ FOUND = Calibration(
     spread={"fx": 3.5, "k1": 0.01}, correlations={"fx k1": -0.75}, held=("aspect",),
     key_pairs=((1, 4), (2, 7)), evidence={"pairs": 12.0},
 )  # fmt: skip
-UNKNOWN = Calibration(np.diag([1200.0, 1200.0, 1.0]), 1000, 750, "exif", False, "an orbit")
+UNKNOWN = Calibration(np.diag([1200.0, 1200.0, 1.0]), 1000, 750, "claim", False, "an orbit")
 
 
 def test_every_field_of_a_calibration_survives():
