@@ -12,16 +12,43 @@ from sfm_app.errors import InputError
 from sfm_app.files import PROGRAM, RUN_FOLDERS, is_made_by_run, read_text, recorded_files
 from sfm_app.operating_system import is_link
 
-EXTENSIONS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts", ".3gp")
+EXTENSIONS = (
+    ".mp4", ".m4v", ".mov", ".3gp", ".3g2", ".insv", ".360", ".lrv", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".vob",
+    ".ts", ".mts", ".m2ts", ".wmv", ".asf", ".flv", ".ogv", ".gif", ".mxf", ".dv", ".rm", ".h264", ".h265", ".ivf",
+)  # fmt: skip
 """Of videos, for error messages only: videos are recognized by their first bytes, and playlists are none."""
-HEAD_BYTES = 400
-"""Enough for three packets of an MPEG transport stream."""
+HEAD_BYTES = 4096
+"""Enough for the kinds of tracks that a header lists, and for five packets of an MPEG transport stream."""
 HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")
 AVIF_BRANDS = (b"avif", b"avis")
 OTHER_BRANDS = (*HEIC_BRANDS, *AVIF_BRANDS, b"crx ", b"M4A ", b"M4B ", b"M4P ")
 """Photos and sound in the container of MP4."""
-ATOMS = (b"moov", b"mdat", b"wide", b"free", b"skip")
-"""First atoms of QuickTime files without a brand."""
+CONTAINERS = {
+    "mov": rb".{4}(ftyp(?!%s)|moov|mdat|wide|free|skip)" % b"|".join(OTHER_BRANDS),
+    "matroska": rb"\x1a\x45\xdf\xa3(.*\x86.V_|(?!.*\x86.A_))",
+    "avi": rb"RIFF.{4}AVI ",
+    "mpeg": rb"\0\0\x01\xba",
+    "mpegvideo": rb"\0\0\x01\xb3",
+    "mpegts": rb".{0,203}?((G.{187}){4}|(G.{191}){4}|(G.{203}){4})G",
+    "asf": rb"\x30\x26\xb2\x75\x8e\x66\xcf\x11(.*\xc0\xef\x19\xbc\x4d\x5b|(?!.*\x40\x9e\x69\xf8\x4d\x5b))",
+    "flv": rb"FLV\x01[^\x04]",
+    "ogg": rb"OggS.*(\x80theora|\x01video|BBCD\0|OVP80)",
+    "mxf": rb"\x06\x0e\x2b\x34\x02\x05\x01\x01\x0d\x01\x02\x01\x01\x02",
+    "gxf": rb"\0\0\0\0\x01\xbc\0\0\0\0\xe1\xe2",
+    "wtv": rb"\xb7\xd8\0\x20\x37\x49\xda\x11\xa6\x4e\0\x07\xe9\x5e\xad\x8d",
+    "rm": rb"\.RMF",
+    "dv": rb"\x1f\x07\0[\x3f\xbf]",
+    "dhav": rb"DHAV",
+    "nut": rb"nut/multimedia container\0",
+    "ivf": rb"DKIF\0\0",
+    "yuv4mpegpipe": rb"YUV4MPEG2 ",
+    "h264": rb"\0?\0\0\x01([\x27\x47\x67]|\x09[\x10\x30\x50\x70\x90\xb0\xd0\xf0]\0)",
+    "hevc": rb"\0?\0\0\x01[\x40\x46]\x01",
+    "obu": rb"\x12\0\x0a[\x01-\x7f]",
+    "gif": rb"GIF8[79]a.*(NETSCAPE2\.0|ANIMEXTS1\.0|\x21\xf9\x04.([^\0]|.[^\0]))",
+    "apng": rb"\x89PNG\r\n\x1a\n.*acTL(?!\0\0\0\x01)",
+}
+"""First bytes of videos by FFmpeg's name of their container. Headers that list sound alone and pictures are none."""
 
 
 def read_head(path: Path) -> bytes:
@@ -35,22 +62,14 @@ def read_head(path: Path) -> bytes:
         return b""
 
 
+def container(head: bytes) -> str:
+    """Return FFmpeg's name of the container of a video that begins so; empty if it is none."""
+    return next((name for name, pattern in CONTAINERS.items() if re.match(pattern, head, re.DOTALL)), "")
+
+
 def is_video(head: bytes) -> bool:
-    """Return whether a file begins like MP4, QuickTime, Matroska, WebM, AVI or MPEG."""
-    if head[4:8] == b"ftyp":
-        return head[8:12] not in OTHER_BRANDS
-    return (
-        head[4:8] in ATOMS
-        or head[:4] == b"\x1a\x45\xdf\xa3"
-        or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")
-        or head[:4] == b"\0\0\x01\xba"
-        or _has_packets(head, first=0, length=188)
-        or _has_packets(head, first=4, length=192)
-    )
-
-
-def _has_packets(head: bytes, first: int, length: int) -> bool:
-    return len(head) == HEAD_BYTES and all(head[k] == 0x47 for k in range(first, HEAD_BYTES, length))
+    """Return whether a file that begins so is a video, and not a photo, a sound or a playlist."""
+    return bool(container(head))
 
 
 MOST_LIST_BYTES = 100_000_000
@@ -223,7 +242,7 @@ def _bad_path_error(path: Path) -> InputError:
         return InputError(f"not a folder: {path}", hint=f"{HINT}, or a video, not a photo")
     if not os.access(path, os.R_OK):
         return InputError(f"cannot read {path}: permission denied")
-    hint = "MP4, MOV, MKV, WebM, AVI and MPEG are read: copy the file again, or save it as MP4"
+    hint = "copy the file again, or save it as MP4"
     return InputError(f"{path} is empty" if not path.stat().st_size else f"not a video: {path}", hint=hint)
 
 

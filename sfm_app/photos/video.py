@@ -1,20 +1,26 @@
 """Frames of a video: read, tracked and chosen."""
 
-import os
+import re
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.photos.decode import UnreadableError
-from sfm_app.photos.files import is_video, read_head
-from sfm_app.photos.panoramas import shrink
+from sfm_app.photos.files import container, read_head
 from sfm_app.types.arrays import BoolArray, FloatArray
+
+if TYPE_CHECKING:  # PyAV takes a tenth of a second to load
+    from av import VideoFrame, VideoStream
+    from av.container import InputContainer
+    from av.filter import Graph
 
 Picture = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
@@ -23,109 +29,243 @@ BLURRED = 0.5
 """A frame with less than this share of its neighbors' sharpness is blurred."""
 MIN_CORNERS = 20
 """Motion is not estimated from fewer corners."""
-
-FFMPEG = {
-    "OPENCV_FFMPEG_CAPTURE_OPTIONS": "protocol_whitelist;file|format_whitelist;mov,matroska,webm,avi,mpeg,mpegts",
-    "OPENCV_FFMPEG_LOGLEVEL": "-8",
-}
-"""Variables that OpenCV reads when it opens a file. Without the first, FFmpeg follows playlists and file patterns."""
+MOST_PIXELS = 8192**2
+"""Largest frame that is decoded: the square of 8K, as domes have it. A decoder holds a dozen of them."""
+SAMPLES_PER_S = 30
+SD_ROWS = 576
+"""A picture with more rows has the colors of HDTV (BT.709) where the file does not say, as players take it."""
+BT709, UNKNOWN = 1, 2
+HDR = {16: "PQ", 18: "HLG"}
+"""Transfer functions of ITU-T H.273 whose white is brighter than that of a photo."""
+WIDE = (9, 11, 12)
+"""Primaries of H.273 beyond those of sRGB: BT.2020, DCI-P3 and Display P3."""
 
 
 @contextmanager
 def open_video(path: Path) -> Iterator["Video"]:
-    """Provide a video that is open for one pass, with FFmpeg silenced; raise an UnreadableError if there is none."""
-    place = path.resolve()  # FFmpeg takes a relative name with a colon for a protocol
-    if not is_video(read_head(place)):
+    """Provide a video that is open for one pass; raise an UnreadableError, also later, if it cannot be read.
+
+    FFmpeg is told the container and gets the open file, and no other: it never follows playlists, URLs or patterns.
+    """
+    import av
+
+    kind = container(read_head(path))
+    if not kind:
         raise UnreadableError("not a video")
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        with _environment(FFMPEG):
-            software = (cv2.CAP_PROP_HW_ACCELERATION, cv2.VIDEO_ACCELERATION_NONE)  # same pixels on every machine
-            capture = cv2.VideoCapture(str(place), cv2.CAP_FFMPEG, software)
-        if not capture.isOpened():
-            raise UnreadableError("damaged, cut off, or of an unknown kind")
-        yield Video(capture)
-        capture.release()
-    finally:
-        cv2.utils.logging.setLogLevel(level)
+        with (
+            path.open("rb") as file,
+            av.open(file, "r", format=kind, options={"max_pixels": str(MOST_PIXELS)}, io_open=_refuse,
+                    metadata_errors="replace") as opened,
+        ):  # fmt: skip
+            yield Video(opened)
+    except av.FFmpegError as err:
+        raise UnreadableError(f"damaged, cut off, or no {av.ContainerFormat(kind).long_name} at all") from err
+    except OSError as err:
+        raise UnreadableError(f"not readable: {err.strerror}") from err
+
+
+def _refuse(*_: object) -> None:
+    raise PermissionError("videos do not open other files")
 
 
 class Video:
-    """An open video, with its rotation applied; frames are numbered from 0."""
+    """An open video; frames are numbered from 0, progressive, upright, and in 8-bit sRGB with square pixels."""
 
-    def __init__(self, capture: cv2.VideoCapture) -> None:
-        self._capture = capture
-        self.rate = max(0.0, capture.get(cv2.CAP_PROP_FPS))
-        """Frames per second as stated in the file; 0 if it is not."""
-        self.claimed = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
-        """Number of frames as stated in the file, which may be wrong."""
+    def __init__(self, opened: "InputContainer") -> None:
+        self._opened, self._stream = opened, _find_stream(opened)
+        context = self._stream.codec_context
+        context.options = {"max_pixels": str(MOST_PIXELS)}
+        context.thread_type = "AUTO"
+        self.codec: str = context.codec.canonical_name
+        rate = float(self._stream.average_rate or 0)
+        self._rate = rate if rate <= 240 else 0.0  # rates above are taken as wrong
+        units = (self._stream.duration, self._stream.time_base), (opened.duration, Fraction(1, 1_000_000))
+        self.claimed_s = next((max(0.0, float(count * unit)) for count, unit in units if count and unit), 0.0)
+        """Duration as stated in the file, which may be wrong; 0 if it is not."""
         self.frames = 0
         """Number of frames read so far."""
         self.seconds = 0.0
-        """Timestamp of the last of them."""
-        self.black = 0
-        """Number of entirely black sampled frames; OpenCV returns interlaced frames black."""
+        """Time of the last of them after the first."""
+        self.notes: dict[str, None] = {}
+        """What was done to the frames, for people."""
+        self._converters: dict[tuple[object, ...], Graph] = {}
 
     @property
-    def stride(self) -> int:
-        """Sampling interval in frames, for about 30 samples per second; rates above 240 are taken as wrong."""
-        return max(1, round(self.rate / 30)) if self.rate <= 240 else 1
+    def samples(self) -> int:
+        """Expected number of sampled frames."""
+        return max(1, int(self.claimed_s * min(self._rate or SAMPLES_PER_S, SAMPLES_PER_S)))
 
     @property
     def is_cut_short(self) -> bool:
-        """Whether the file ended before 95 % of its stated length; valid once all frames are read."""
-        if not (self.rate and self.claimed):
-            return False
-        # by time: a frame count derived from a wrong rate is wrong, too
-        return self.seconds + 2 / self.rate < 0.95 * self.claimed / self.rate
+        """Whether the file ended before 95 % of its stated duration; valid once all frames are read."""
+        return self.seconds + 2 / (self._rate or SAMPLES_PER_S) < 0.95 * self.claimed_s
 
     def small_frames(self) -> Iterator[tuple[int, Picture]]:
-        """Yield gray pictures of the sampled frames, with a longer side of 480 pixels, with their numbers."""
-        for number in self._grab_frames():
-            if number % self.stride:
+        """Yield gray pictures of about 30 frames per second with their numbers, as stored: not turned.
+
+        Their longer side has at most 480 pixels, and all have the size of the first.
+        """
+        last = -1
+        size: tuple[int, int] | None = None
+        for number, frame in self._read_frames():
+            tick = int(self.seconds * SAMPLES_PER_S + 0.1) if self._rate else number
+            if tick <= last or frame.is_corrupt:
                 continue
-            decoded, picture = self._capture.retrieve()
-            if not decoded:
-                continue
-            if not picture.any():
-                self.black += 1
-                continue
-            small = shrink(picture, 480 / max(picture.shape[:2]))
-            yield number, np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY) if small.ndim == 3 else small, np.uint8)
+            last = tick
+            if size is None:
+                width, height = self._square_size(frame)
+                share = min(1.0, 480 / max(width, height))
+                size = max(1, round(width * share)), max(1, round(height * share))
+            yield number, self._convert(frame, size, "gray")
 
     def jpegs(self, numbers: Sequence[int]) -> Iterator[tuple[int, bytes]]:
         """Yield these frames at full size as JPEG, in ascending order; fewer if the file has changed."""
         missing = set(numbers)
-        for number in self._grab_frames():
+        for number, frame in self._read_frames():
             if number in missing:
-                decoded, picture = self._capture.retrieve()
-                if decoded:
-                    yield number, cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+                picture = self._upright(frame, self._convert(frame, self._square_size(frame), "bgr24"))
+                yield number, cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
                 missing.remove(number)
             if not missing:
                 return
 
-    def _grab_frames(self) -> Iterator[int]:
-        """Yield frame numbers; each frame can be retrieved until the next one is grabbed."""
-        while self._capture.grab():
+    def _read_frames(self) -> Iterator[tuple[int, "VideoFrame"]]:
+        start: float | None = None
+        for frame in self._deinterlace(self._decode()):
+            if frame.time is not None:
+                start = frame.time if start is None else start
+                self.seconds = max(self.seconds, frame.time - start)
+            elif self.frames:
+                self.seconds += 1 / (self._rate or SAMPLES_PER_S)
             self.frames += 1
-            self.seconds = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            yield self.frames - 1
+            yield self.frames - 1, frame
 
+    def _decode(self) -> Iterator["VideoFrame"]:
+        """Yield all frames that can be decoded; those after damage, too."""
+        import av
 
-@contextmanager
-def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
+        packets = self._opened.demux(self._stream)
+        while True:
+            try:
+                packet = next(packets)
+            except (StopIteration, av.FFmpegError):  # the end, or bytes of which nothing follows
+                return
+            if packet.has_sidedata("encryption_info"):
+                raise UnreadableError("encrypted: a player with its license reads it, and no other program")
+            try:
+                frames = packet.decode()
+            except av.FFmpegError:
+                continue
+            yield from frames
+
+    def _deinterlace(self, frames: Iterator["VideoFrame"]) -> Iterator["VideoFrame"]:
+        """Yield as many progressive frames. All frames from the first interlaced one go through the filter."""
+        graph: Graph | None = None
+        shape: tuple[object, ...] = ()
+        for frame in frames:
+            if graph is not None and shape != (frame.width, frame.height, frame.format.name):
+                yield from _pull(graph, None)
+                graph = None
+            if graph is None and frame.interlaced_frame:
+                self.notes["interlaced frames were deinterlaced"] = None
+                graph = _make_graph(frame, ("bwdif", "mode=send_frame:deint=interlaced"))
+                shape = frame.width, frame.height, frame.format.name
+            if graph is None:
+                yield frame
             else:
-                os.environ[name] = value
+                yield from _pull(graph, frame)
+        if graph is not None:
+            yield from _pull(graph, None)
+
+    def _square_size(self, frame: "VideoFrame") -> tuple[int, int]:
+        """Return width and height with square pixels; the narrower side of the pixels is kept."""
+        ratio = float(self._stream.sample_aspect_ratio or 1)
+        if abs(ratio - 1) < 0.001 or not 1 / 4 < ratio < 4:  # an anamorphic lens has 2; more is a mistake
+            return frame.width, frame.height
+        self.notes[f"its pixels of {ratio:.2f} : 1 were made square"] = None
+        return (round(frame.width * ratio), frame.height) if ratio > 1 else (frame.width, round(frame.height / ratio))
+
+    def _convert(self, frame: "VideoFrame", size: tuple[int, int], kind: str) -> Picture:
+        """Return the frame in BT.709 at full range: (H, W) gray, or (H, W, 3) in colors that a screen can show."""
+        width, height = size
+        area = "area" if kind == "gray" else "bicubic"
+        arguments = f"{width}:{height}:flags={area}+accurate_rnd+full_chroma_int+bitexact:out_range=pc"
+        if frame.colorspace == UNKNOWN and frame.height > SD_ROWS and "rgb" not in frame.format.name:
+            arguments += ":in_color_matrix=bt709"
+        if kind != "gray" and (frame.color_trc in HDR or frame.color_primaries in WIDE):
+            curve = "iec61966-2-1" if frame.color_trc in HDR else "bt709"
+            arguments += f":out_primaries=bt709:out_transfer={curve}:intent=perceptual"
+            self.notes[f"{HDR.get(frame.color_trc, 'wide')} colors were toned to sRGB"] = None
+        key = frame.width, frame.height, frame.format.name, arguments, kind
+        if key not in self._converters:
+            self._converters = {key: _make_graph(frame, ("scale", arguments), ("format", kind))}
+        (converted,) = _pull(self._converters[key], frame)
+        return np.asarray(converted.to_ndarray(), np.uint8)
+
+    @staticmethod
+    def _upright(frame: "VideoFrame", picture: Picture) -> Picture:
+        """Turn and mirror a picture as the display matrix of its frame says."""
+        side_data: Any = frame.side_data
+        if (matrix := side_data.get("DISPLAYMATRIX")) is None:
+            return picture
+        (a, b), (c, d) = np.frombuffer(bytes(matrix), np.int32).reshape(3, 3)[:2, :2].tolist()
+        across, down = a, d
+        if abs(b) + abs(c) > abs(a) + abs(d):
+            picture, across, down = picture.swapaxes(0, 1), c, b  # x' = ax + cy, y' = bx + dy
+        return np.ascontiguousarray(picture[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1])
+
+
+def _find_stream(opened: "InputContainer") -> "VideoStream":
+    """Return the largest stream of frames; raise an UnreadableError if there is none, or none that is decoded."""
+    from av.stream import Disposition
+
+    pictures = Disposition.attached_pic | Disposition.timed_thumbnails
+    streams = [stream for stream in opened.streams.video if not stream.disposition & pictures]
+    if not streams:
+        has = "sound, but no video" if opened.streams.audio else "no video"
+        raise UnreadableError(f"there is {has} in this {opened.format.long_name} file")
+    known = [stream for stream in streams if stream.codec_context is not None]
+    if not known:
+        raise UnreadableError(f"a video in the codec {_codec_name(opened)}, which cannot be decoded")
+    stream = max(known, key=lambda stream: stream.width * stream.height)
+    if stream.width * stream.height > MOST_PIXELS:
+        raise UnreadableError(f"too many pixels: {stream.width} x {stream.height}")
+    return stream
+
+
+def _codec_name(opened: Any) -> str:
+    """Return the name of the first codec, which PyAV has of known decoders only."""
+    import av
+
+    before = av.logging.get_level()
+    try:
+        av.logging.set_level(av.logging.INFO)
+        told = re.search(r"Video: (none )?\(?(\w+)", opened.dumps_format())
+    finally:
+        av.logging.set_level(before)
+    return told[2] if told else "of no name"
+
+
+def _make_graph(frame: "VideoFrame", *filters: tuple[str, str]) -> "Graph":
+    from av.filter import Graph
+
+    graph = Graph()
+    unit = frame.time_base or Fraction(1, SAMPLES_PER_S)
+    source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=unit)
+    nodes = [graph.add(name, arguments) for name, arguments in filters]
+    graph.link_nodes(source, *nodes, graph.add("buffersink")).configure()
+    return graph
+
+
+def _pull(graph: "Graph", frame: "VideoFrame | None") -> Iterator["VideoFrame"]:
+    """Push a frame, or the end, and yield the frames that are done."""
+    graph.vpush(frame)
+    while True:
+        try:
+            yield graph.vpull()
+        except (BlockingIOError, EOFError):
+            return
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,23 +81,19 @@ def choose_frames(source: Path, run: RunContext) -> FrameChoice:
     try:
         with open_video(source) as video:
             tracker = CornerTracker()
-            samples = max(1, video.claimed // video.stride)
-            pictures = track(run.progress, video.small_frames(), "tracking frames", samples)
+            pictures = track(run.progress, video.small_frames(), "tracking frames", video.samples)
             tracked, times_s = [], {}
             for number, small in pictures:
                 tracked.append(tracker.track(number, small))
                 times_s[number] = video.seconds
     except UnreadableError as err:
         raise InputError(f"cannot read {source}: {err}", hint=DAMAGED) from err
-    sampled, notes = len(tracked) + video.black, []
-    if video.black and not tracked:
-        hint = "save it deinterlaced (progressive), as MP4 with H.264"
-        raise InputError(f"cannot read {source}: all frames are black, as those of interlaced videos", hint=hint)
+    sampled, notes = len(tracked), [*video.notes]
     if video.is_cut_short:
         tracked = tracked[:-1]  # it may be half a picture
-        notes = [f"the file is cut off or damaged after {video.seconds:.1f} s; the frames before are used"]
+        notes.append(f"the file is cut off or damaged after {video.seconds:.1f} s; the frames before are used")
     if not tracked:
-        raise InputError(f"cannot read {source}: no frame can be decoded", hint=DAMAGED)
+        raise InputError(f"cannot read {source}: no frame of its {video.codec} can be decoded", hint=DAMAGED)
     choice = select_keyframes(tracked, run.settings.photos.max_frames)
     if len(choice.frames) < 2:
         problem = "the camera does not move" if tracker.has_texture else "there is too little texture to track"
@@ -108,7 +104,7 @@ def choose_frames(source: Path, run: RunContext) -> FrameChoice:
         "seconds": round(video.seconds, 2),
         "looked_at": sampled,
         "chosen": len(choice.frames),
-        "left_out": choice.rejected | ({"black": video.black} if video.black else {}),
+        "left_out": choice.rejected,
         "notes": notes,
     }
     return FrameChoice(run.fingerprint, choice.frames, tuple(times_s[frame] for frame in choice.frames), counts)
