@@ -34,39 +34,32 @@ MOST_PIXELS = 8192**2
 SAMPLES_PER_S = 30
 SD_ROWS = 576
 """A picture with more rows has the colors of HDTV (BT.709) where the file does not say, as players take it."""
-BT709, UNKNOWN = 1, 2
+UNKNOWN = 2
+"""Colors that are not stated, in ITU-T H.273."""
 HDR = {16: "PQ", 18: "HLG"}
-"""Transfer functions of ITU-T H.273 whose white is brighter than that of a photo."""
+"""Transfer functions of H.273 whose white is brighter than that of a photo."""
 WIDE = (9, 11, 12)
 """Primaries of H.273 beyond those of sRGB: BT.2020, DCI-P3 and Display P3."""
+ENCRYPTED = "encrypted: no program but a player with its license reads it"
 
 
 @contextmanager
 def open_video(path: Path) -> Iterator["Video"]:
     """Provide a video that is open for one pass; raise an UnreadableError, also later, if it cannot be read.
 
-    FFmpeg is told the container and gets the open file, and no other: it never follows playlists, URLs or patterns.
+    FFmpeg is told the container and may open files alone: it never follows playlists, URLs or patterns of names.
     """
     import av
 
     kind = container(read_head(path))
     if not kind:
         raise UnreadableError("not a video")
+    options = {"protocol_whitelist": "file", "max_pixels": str(MOST_PIXELS)}
     try:
-        with (
-            path.open("rb") as file,
-            av.open(file, "r", format=kind, options={"max_pixels": str(MOST_PIXELS)}, io_open=_refuse,
-                    metadata_errors="replace") as opened,
-        ):  # fmt: skip
+        with av.open(f"file:{path.resolve()}", "r", kind, options=options, metadata_errors="replace") as opened:
             yield Video(opened)
     except av.FFmpegError as err:
         raise UnreadableError(f"damaged, cut off, or no {av.ContainerFormat(kind).long_name} at all") from err
-    except OSError as err:
-        raise UnreadableError(f"not readable: {err.strerror}") from err
-
-
-def _refuse(*_: object) -> None:
-    raise PermissionError("videos do not open other files")
 
 
 class Video:
@@ -99,7 +92,9 @@ class Video:
     @property
     def is_cut_short(self) -> bool:
         """Whether the file ended before 95 % of its stated duration; valid once all frames are read."""
-        return self.seconds + 2 / (self._rate or SAMPLES_PER_S) < 0.95 * self.claimed_s
+        return (
+            self.seconds + 4 / (self._rate or SAMPLES_PER_S) < 0.95 * self.claimed_s
+        )  # some count reordered frames, too
 
     def small_frames(self) -> Iterator[tuple[int, Picture]]:
         """Yield gray pictures of about 30 frames per second with their numbers, as stored: not turned.
@@ -109,7 +104,7 @@ class Video:
         last = -1
         size: tuple[int, int] | None = None
         for number, frame in self._read_frames():
-            tick = int(self.seconds * SAMPLES_PER_S + 0.1) if self._rate else number
+            tick = int(self.seconds * SAMPLES_PER_S + 0.2) if self._rate else number
             if tick <= last or frame.is_corrupt:
                 continue
             last = tick
@@ -131,12 +126,14 @@ class Video:
                 return
 
     def _read_frames(self) -> Iterator[tuple[int, "VideoFrame"]]:
-        start: float | None = None
+        start = 0.0
         for frame in self._deinterlace(self._decode()):
-            if frame.time is not None:
-                start = frame.time if start is None else start
-                self.seconds = max(self.seconds, frame.time - start)
-            elif self.frames:
+            time: float | None = frame.time
+            if not self.frames:
+                start = time or 0.0
+            elif time is not None and time - start > self.seconds:
+                self.seconds = time - start
+            else:  # frames come in order: a time that goes back, as of B-frames in AVI, is wrong
                 self.seconds += 1 / (self._rate or SAMPLES_PER_S)
             self.frames += 1
             yield self.frames - 1, frame
@@ -152,7 +149,7 @@ class Video:
             except (StopIteration, av.FFmpegError):  # the end, or bytes of which nothing follows
                 return
             if packet.has_sidedata("encryption_info"):
-                raise UnreadableError("encrypted: a player with its license reads it, and no other program")
+                raise UnreadableError(ENCRYPTED)
             try:
                 frames = packet.decode()
             except av.FFmpegError:
@@ -227,7 +224,8 @@ def _find_stream(opened: "InputContainer") -> "VideoStream":
         raise UnreadableError(f"there is {has} in this {opened.format.long_name} file")
     known = [stream for stream in streams if stream.codec_context is not None]
     if not known:
-        raise UnreadableError(f"a video in the codec {_codec_name(opened)}, which cannot be decoded")
+        name = _codec_name(opened)
+        raise UnreadableError(ENCRYPTED if name in ("encv", "drmi") else f"its codec, {name}, cannot be decoded")
     stream = max(known, key=lambda stream: stream.width * stream.height)
     if stream.width * stream.height > MOST_PIXELS:
         raise UnreadableError(f"too many pixels: {stream.width} x {stream.height}")
@@ -244,7 +242,7 @@ def _codec_name(opened: Any) -> str:
         told = re.search(r"Video: (none )?\(?(\w+)", opened.dumps_format())
     finally:
         av.logging.set_level(before)
-    return told[2] if told else "of no name"
+    return told[2] if told and told[2] != "none" else "an unknown one"
 
 
 def _make_graph(frame: "VideoFrame", *filters: tuple[str, str]) -> "Graph":
