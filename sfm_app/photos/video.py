@@ -73,8 +73,9 @@ class Video:
         self.codec: str = context.codec.canonical_name
         rate = float(self._stream.average_rate or 0)
         self._rate = rate if rate <= 240 else 0.0  # rates above are taken as wrong
+        counted = self._stream.frames / self._rate if self._rate else 0.0
         units = (self._stream.duration, self._stream.time_base), (opened.duration, Fraction(1, 1_000_000))
-        self.claimed_s = next((max(0.0, float(count * unit)) for count, unit in units if count and unit), 0.0)
+        self.claimed_s = max(counted, *[float(n * unit) for n, unit in units if n and unit][:1], 0.0)
         """Duration as stated in the file, which may be wrong; 0 if it is not."""
         self.frames = 0
         """Number of frames read so far."""
@@ -191,9 +192,9 @@ class Video:
         if frame.colorspace == UNKNOWN and frame.height > SD_ROWS and "rgb" not in frame.format.name:
             arguments += ":in_color_matrix=bt709"
         if kind != "gray" and (frame.color_trc in HDR or frame.color_primaries in WIDE):
-            curve = "iec61966-2-1" if frame.color_trc in HDR else "bt709"
-            arguments += f":out_primaries=bt709:out_transfer={curve}:intent=perceptual"
-            self.notes[f"{HDR.get(frame.color_trc, 'wide')} colors were toned to sRGB"] = None
+            tone = "iec61966-2-1:intent=perceptual" if frame.color_trc in HDR else "bt709"
+            arguments += f":out_primaries=bt709:out_transfer={tone}"
+            self.notes[f"{HDR.get(frame.color_trc, 'wide')} colors were converted to sRGB"] = None
         key = frame.width, frame.height, frame.format.name, arguments, kind
         if key not in self._converters:
             self._converters = {key: _make_graph(frame, ("scale", arguments), ("format", kind))}
@@ -226,10 +227,7 @@ def _find_stream(opened: "InputContainer") -> "VideoStream":
     if not known:
         name = _codec_name(opened)
         raise UnreadableError(ENCRYPTED if name in ("encv", "drmi") else f"its codec, {name}, cannot be decoded")
-    stream = max(known, key=lambda stream: stream.width * stream.height)
-    if stream.width * stream.height > MOST_PIXELS:
-        raise UnreadableError(f"too many pixels: {stream.width} x {stream.height}")
-    return stream
+    return max(known, key=lambda stream: stream.width * stream.height)
 
 
 def _codec_name(opened: Any) -> str:

@@ -19,7 +19,7 @@ from sfm_app.photos.masks import MASK_HINT, assign_masks, check_mask, lay_out_ma
 from sfm_app.photos.probe import group_by_camera, read_photo, split_by_given_camera
 from sfm_app.photos.selection import PhotoStats, drop_duplicates, drop_unusable, read_stats, write_stats
 from sfm_app.photos.source import Source, assign_names, is_laid_out, lay_out
-from sfm_app.photos.video import CornerTracker, open_video, select_keyframes
+from sfm_app.photos.video import MOST_PIXELS, CornerTracker, open_video, select_keyframes
 from sfm_app.products import read_copy_hashes, read_photo_list, write_photo_list
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
@@ -88,12 +88,13 @@ def choose_frames(source: Path, run: RunContext) -> FrameChoice:
                 times_s[number] = video.seconds
     except UnreadableError as err:
         raise InputError(f"cannot read {source}: {err}", hint=DAMAGED) from err
-    sampled, notes = len(tracked), [*video.notes]
+    sampled, notes = len(tracked), list(video.notes)
     if video.is_cut_short:
         tracked = tracked[:-1]  # it may be half a picture
         notes.append(f"the file is cut off or damaged after {video.seconds:.1f} s; the frames before are used")
     if not tracked:
-        raise InputError(f"cannot read {source}: no frame of its {video.codec} can be decoded", hint=DAMAGED)
+        limit = f"of at most {MOST_PIXELS // 10**6} megapixels"
+        raise InputError(f"cannot read {source}: no frame of its {video.codec}, {limit}, can be decoded", hint=DAMAGED)
     choice = select_keyframes(tracked, run.settings.photos.max_frames)
     if len(choice.frames) < 2:
         problem = "the camera does not move" if tracker.has_texture else "there is too little texture to track"

