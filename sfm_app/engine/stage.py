@@ -145,7 +145,7 @@ def manifest_head(run: RunContext) -> dict[str, Any]:
 @cache
 def versions() -> dict[str, str]:
     """Return the versions of the program and of the libraries that compute the result."""
-    parts = ("sfm-app", "numpy", "numba", "opencv-contrib-python-headless", "pyproj")
+    parts = ("sfm-app", "numpy", "numba", "opencv-contrib-python-headless", "pyproj", "av")
     try:
         open3d = version("open3d-cpu")  # the wheel without CUDA, which few systems have
     except PackageNotFoundError:
