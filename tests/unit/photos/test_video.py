@@ -31,10 +31,10 @@ def pictures(count=COUNT, size=SIZE):
 
 
 def write(path, codec="mjpeg", kind=None, *, frames=None, rate=30, pts=None, **values):
-    """A video; `values` are of the encoder, and its options."""
+    """A video; `values` are of the encoder, its `options`, and those of the `muxer`."""
     frames = list(pictures() if frames is None else frames)
     options = values.pop("options", {})
-    with av.open(str(path), "w", format=kind) as made:
+    with av.open(str(path), "w", format=kind, options=values.pop("muxer", {})) as made:
         stream = made.add_stream(codec, rate=rate, options=options)
         height, width = getattr(frames[0], "shape", (0, 0))[:2]
         stream.width, stream.height = width or frames[0].width, height or frames[0].height
@@ -333,19 +333,6 @@ def test_lists_of_other_files_are_not_followed(tmp_path, kind, ending, begin):
         raise UnreadableError("no frames")
 
 
-def test_a_movie_does_not_refer_to_other_files(tmp_path):
-    """QuickTime may keep its frames elsewhere."""
-    path = write(tmp_path / "a.mov", "mjpeg")
-    (tmp_path / "b.mov").write_bytes(path.read_bytes())
-    data = path.read_bytes()
-    reference = data.index(b"dref") + 12
-    data = data[:reference] + struct.pack(">I4sI", 12, b"url ", 0) + data[reference + 12 :]  # not in this file
-    path.write_bytes(data[: data.index(b"mdat") + 4] + bytes(len(data) - data.index(b"mdat") - 4))
-    path.write_bytes(data)
-    with open_video(path) as found:
-        assert len(list(found.small_frames())) in (0, COUNT)
-
-
 def test_nothing_but_regular_files_is_opened(tmp_path):
     os.mkfifo(tmp_path / "pipe.mp4")
     assert not is_video(read_head(tmp_path / "pipe.mp4"))
@@ -393,11 +380,29 @@ def test_a_codec_that_cannot_be_decoded_is_named(tmp_path, code, reason):
         pass
 
 
-def test_pictures_in_a_sound_file_are_no_video(tmp_path):
-    """The cover of an album."""
-    path = write(tmp_path / "a.mkv", "mjpeg", frames=pictures(1))
-    with open_video(path) as found:
-        assert len(list(found.small_frames())) == 1
+def test_the_cover_of_an_album_is_no_video(tmp_path):
+    with av.open(str(tmp_path / "a.mp4"), "w") as made:
+        cover = made.add_stream("mjpeg", rate=1)
+        cover.width, cover.height, cover.pix_fmt = *SIZE, "yuvj420p"
+        cover.disposition = av.stream.Disposition.attached_pic
+        stream = made.add_stream("aac", rate=44100, layout="mono")
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
+        frame.sample_rate = 44100
+        made.mux(cover.encode(av.VideoFrame.from_ndarray(next(pictures()), "rgb24")))
+        made.mux(stream.encode(frame))
+        made.mux(stream.encode())
+    with pytest.raises(UnreadableError, match="sound, but no video"), open_video(tmp_path / "a.mp4"):
+        pass
+
+
+def test_an_encrypted_video_says_so(tmp_path):
+    path = write(
+        tmp_path / "a.mp4",
+        "libx264",
+        muxer={"encryption_scheme": "cenc-aes-ctr", "encryption_key": "12" * 16, "encryption_kid": "34" * 16},
+    )
+    with pytest.raises(UnreadableError, match="encrypted"):
+        numbers_of(path)
 
 
 def test_a_bomb_of_pixels_is_refused(tmp_path):
