@@ -17,7 +17,7 @@ EXTENSIONS = (
     ".ts", ".mts", ".m2ts", ".wmv", ".asf", ".flv", ".ogv", ".gif", ".mxf", ".dv", ".rm", ".h264", ".h265", ".ivf",
 )  # fmt: skip
 """Of videos, for error messages only: videos are recognized by their first bytes, and playlists are none."""
-HEAD_BYTES = 4096
+HEAD_BYTES = 16384
 """Enough for the kinds of tracks that a header lists, and for five packets of an MPEG transport stream."""
 HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")
 AVIF_BRANDS = (b"avif", b"avis")
