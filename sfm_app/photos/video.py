@@ -93,9 +93,8 @@ class Video:
     @property
     def is_cut_short(self) -> bool:
         """Whether the file ended before 95 % of its stated duration; valid once all frames are read."""
-        return (
-            self.seconds + 4 / (self._rate or SAMPLES_PER_S) < 0.95 * self.claimed_s
-        )  # some count reordered frames, too
+        reordered_s = 4 / (self._rate or SAMPLES_PER_S)  # some files count these twice
+        return self.seconds + reordered_s < 0.95 * self.claimed_s
 
     def small_frames(self) -> Iterator[tuple[int, Picture]]:
         """Yield gray pictures of about 30 frames per second with their numbers, as stored: not turned.
@@ -191,10 +190,10 @@ class Video:
         arguments = f"{width}:{height}:flags={area}+accurate_rnd+full_chroma_int+bitexact:out_range=pc"
         if frame.colorspace == UNKNOWN and frame.height > SD_ROWS and "rgb" not in frame.format.name:
             arguments += ":in_color_matrix=bt709"
-        if kind != "gray" and (frame.color_trc in HDR or frame.color_primaries in WIDE):
-            tone = "iec61966-2-1:intent=perceptual" if frame.color_trc in HDR else "bt709"
-            arguments += f":out_primaries=bt709:out_transfer={tone}"
+        if frame.color_trc in HDR or frame.color_primaries in WIDE:
             self.notes[f"{HDR.get(frame.color_trc, 'wide')} colors were converted to sRGB"] = None
+            tone = "iec61966-2-1:intent=perceptual" if frame.color_trc in HDR else "bt709"
+            arguments += "" if kind == "gray" else f":out_primaries=bt709:out_transfer={tone}"
         key = frame.width, frame.height, frame.format.name, arguments, kind
         if key not in self._converters:
             self._converters = {key: _make_graph(frame, ("scale", arguments), ("format", kind))}

@@ -60,9 +60,12 @@ def numbers_of(path):
 
 
 def read(path, numbers=range(COUNT)):
-    """The frames of a video, in RGB, and the notes."""
+    """The frames of a video, in RGB, and the notes, which do not wait for the frames to be chosen."""
     with open_video(path) as found:
-        return [decoded(data)[..., ::-1] for _, data in found.jpegs(numbers)], [*found.notes]
+        list(found.small_frames())
+        notes = [*found.notes]
+    with open_video(path) as found:
+        return [decoded(data)[..., ::-1] for _, data in found.jpegs(numbers)], notes
 
 
 def decoded(data):
