@@ -31,6 +31,8 @@ MIN_CORNERS = 20
 """Motion is not estimated from fewer corners."""
 MOST_PIXELS = 8192**2
 """Largest frame that is decoded: the square of 8K, as domes have it. A decoder holds a dozen of them."""
+THREADS = 4
+"""Threads of a decoder on every machine: after damage, their number decides which frames it gives."""
 SAMPLES_PER_S = 30
 SD_ROWS = 576
 """A picture with more rows has the colors of HDTV (BT.709) where the file does not say, as players take it."""
@@ -69,7 +71,7 @@ class Video:
         self._opened, self._stream = opened, _find_stream(opened)
         context = self._stream.codec_context
         context.options = {"max_pixels": str(MOST_PIXELS)}
-        context.thread_type = "AUTO"
+        context.thread_type, context.thread_count = "AUTO", THREADS
         self.codec: str = context.codec.canonical_name
         rate = float(self._stream.average_rate or 0)
         self._rate = rate if rate <= 240 else 0.0  # rates above are taken as wrong
