@@ -20,13 +20,14 @@ from sfm_app.report.text import duration_text
 from sfm_app.runtime.parallel import worker_count
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
-from sfm_app.synthetic.cameras import ArcOptions, Camera, Lens, Views, arc, camera_center, make_camera, make_wide_camera
+from sfm_app.synthetic.cameras import ArcOptions, Camera, Lens, Views, arc, make_camera, make_wide_camera
 from sfm_app.synthetic.compare import center_error_percent, focal_error_percent, surface_errors
 from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth, write_photo_folder
 from sfm_app.synthetic.render import PreparedModel, comparison_image
 from sfm_app.synthetic.scenes import courtyard, statue, statue_views
 from sfm_app.synthetic.shapes import SyntheticScene
 from sfm_app.types import CameraModel, Model, Scene
+from sfm_app.types.scene import camera_center
 
 SIZE = (960, 640)
 """Width and height of the photos of most scenes, in pixels. Chosen by hand."""

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.geometry.triangles import cluster
 from sfm_app.meshing.ray_casting import Occluders, load_open3d
-from sfm_app.synthetic.cameras import Camera, Views, camera_center
+from sfm_app.synthetic.cameras import Camera, Views
 from sfm_app.types import CameraModel, PosedPhoto, Scene
+from sfm_app.types.scene import camera_center
 
 FloatArray = NDArray[np.float64]
 POINTS_PER_PHOTO = 150

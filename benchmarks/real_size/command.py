@@ -22,8 +22,9 @@ from benchmarks.synthetic.scenes import WALKS, build_scene, scene_views
 from sfm_app.colmap.backend import Reconstruction
 from sfm_app.colmap.model import poses_and_points
 from sfm_app.geometry.poses import Similarity, umeyama
-from sfm_app.synthetic.cameras import Views, camera_center
+from sfm_app.synthetic.cameras import Views
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
+from sfm_app.types.scene import camera_center
 
 ABOUT = (
     "Error of the size, in percent, against the true camera centers, and of the deviation that is stated; center mm: "

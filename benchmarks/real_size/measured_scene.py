@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from benchmarks.synthetic.scenes import marker_sheet
 from sfm_app.frame.coordinates import LocalFrame, read_system
 from sfm_app.frame.markers import draw_pattern
-from sfm_app.synthetic.cameras import Views, camera_center
+from sfm_app.synthetic.cameras import Views
 from sfm_app.synthetic.shapes import SyntheticScene
+from sfm_app.types.scene import camera_center
 
 FloatArray = NDArray[np.float64]
 

@@ -23,7 +23,6 @@ from sfm_app.synthetic.cameras import (
     Views,
     arc,
     axis_rotation,
-    camera_center,
     look_at,
     make_camera,
     pixel_rays,
@@ -44,6 +43,7 @@ from sfm_app.synthetic.scenes import (
     WOOD,
 )
 from sfm_app.synthetic.shapes import Body, Material, Shape, SyntheticScene, ball, box, ground, revolve, torus
+from sfm_app.types.scene import camera_center
 
 Random = np.random.Generator
 FloatArray = NDArray[np.float64]

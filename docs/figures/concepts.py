@@ -14,12 +14,13 @@ from sfm_app.geometry.epipolar import fundamental_from_pose, to_homogeneous
 from sfm_app.selfcal.consensus import Consensus
 from sfm_app.selfcal.pairs import prepare
 from sfm_app.selfcal.thesis.curves import focal_curves
-from sfm_app.synthetic.cameras import Camera, arc, camera_center, make_camera, pixel_rays
+from sfm_app.synthetic.cameras import Camera, arc, make_camera, pixel_rays
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.synthetic.render import GAMMA, cast_rays, render_scene
 from sfm_app.synthetic.render import prepare as prepare_scene
 from sfm_app.synthetic.scenes import courtyard
 from sfm_app.types import CameraPairs
+from sfm_app.types.scene import camera_center
 
 FloatArray = NDArray[np.float64]
 PICTURES = Path(__file__).parents[1] / "pictures"

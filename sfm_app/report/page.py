@@ -120,6 +120,9 @@ def render_page(contents: RunContents, parts: LargeParts, other: RunContents | N
     model = _read_model(contents)
     rows = photo_rows(contents, model, parts.pictures)
     warnings, others = findings.remarks(contents)
+    photos = [
+        {key: value for key, value in asdict(row).items() if key != "picture" and value is not None} for row in rows
+    ]
     page = _environment().get_template("page.html.jinja").render(
         title=contents.run.workspace.root.resolve().name,
         headline=headline(contents, rows),
@@ -141,7 +144,7 @@ def render_page(contents: RunContents, parts: LargeParts, other: RunContents | N
         depth_count=len(contents.counts("depth_maps").get("coverage", ())),
         view=parts.view is not None and bool(three_script()),
         served=parts.is_served,
-        data=script_data({"view": parts.view, "photos": [_photo_data(row) for row in rows]}),
+        data=script_data({"view": parts.view, "photos": photos}),
         three=Markup(three_script()),  # noqa: S704 - a script of an installed package, without user text
     )  # fmt: skip
     return page.encode("utf-8", "replace").decode("utf-8")  # names of files need not be text
@@ -166,10 +169,6 @@ def headline(contents: RunContents, rows: Sequence[PhotoRow]) -> str:
         return f"{count} usable photos, not mapped yet."
     what = "A textured model" if "files" in contents.stages else "Cameras and points"
     return f"{what} from {f'all {count}' if placed == count else f'{placed} of {count}'} photos."
-
-
-def _photo_data(row: PhotoRow) -> dict[str, Any]:
-    return {key: value for key, value in asdict(row).items() if key != "picture" and value is not None}
 
 
 def script_data(value: Any) -> Markup:

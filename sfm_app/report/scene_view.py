@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.colmap.model import sparse_model
 from sfm_app.formats.frusta import frustum_depth, scene_size
@@ -33,11 +32,12 @@ def embedded_view(contents: RunContents, photos: Sequence[str]) -> Mapping[str, 
     points = view_points(contents)
     if points is None:
         return None
-    places, colors = _sample(points)
+    places, colors = points.surface.vertices, points.surface.colors
+    chosen = np.sort(np.random.default_rng(0).permutation(len(places))[:60_000])
     return {
         "glb": _base64(_model_bytes(contents)),
-        "places": _base64(places.astype("<f4").tobytes()),
-        "colors": _base64(colors.tobytes()),
+        "places": _base64(places[chosen].astype("<f4").tobytes()),
+        "colors": _base64(colors[chosen].tobytes()),
     } | view_frame(contents, points, photos)
 
 
@@ -96,12 +96,6 @@ def lighten(model: Model) -> Model:
     pages = tuple(shrink(page, LIGHT_PAGE_PX / max(page.shape)) for page in model.texture.pages)
     maps = tuple(shrink(one, LIGHT_PAGE_PX // 2 / max(one.shape)) for one in model.texture.normal_maps)
     return replace(model, texture=replace(model.texture, pages=pages, normal_maps=maps))
-
-
-def _sample(points: Model) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    places, colors = points.surface.vertices, points.surface.colors
-    chosen = np.sort(np.random.default_rng(0).permutation(len(places))[:60_000])
-    return places[chosen], np.ascontiguousarray(colors[chosen])
 
 
 def _bounds(points: Model) -> tuple[list[float], float]:

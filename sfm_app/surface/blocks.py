@@ -6,7 +6,7 @@ resumes at the missing blocks.
 
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -293,7 +293,12 @@ def mesh_in_blocks(
     run.record(blocks=len(tasks), planes=[list(plane) for plane in partition.planes()])
     run.record(cell=cell, raw_triangles=sum(raw), open_border_edges=open_edges)
     if run.settings.texture.normal_map:
-        save_fine(_parts_without_halo(tasks, partition), run.workspace.fine_surface)
+        fine = ((task, FineShape.load(task.fine_path)) for task in tasks)
+        parts = (  # each block without its halo, where its neighbors are better
+            shape.select(partition.find_blocks(shape.vertices[shape.faces].mean(axis=1)) == task.number)
+            for task, shape in fine
+        )
+        save_fine(parts, run.workspace.fine_surface)
     shutil.rmtree(folder)
     return surface
 
@@ -319,13 +324,6 @@ def mesh_block(task: BlockTask) -> int:
         np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors, raw=raw)
     shutil.rmtree(scratch)
     return raw
-
-
-def _parts_without_halo(tasks: Sequence[BlockTask], partition: Partition) -> Iterator[FineShape]:
-    """Yield the fine surface of each block without its halo, where its neighbors are better."""
-    for task in tasks:
-        fine = FineShape.load(task.fine_path)
-        yield fine.select(partition.find_blocks(fine.vertices[fine.faces].mean(axis=1)) == task.number)
 
 
 def join_blocks(node: Split | int, tasks: Sequence[BlockTask], cell: float) -> tuple[Surface, int]:

@@ -64,7 +64,8 @@ def fuse_maps(dense_dir: Path, views: Sequence[View], min_views: int, target: Pa
             fuse(dense_dir, min_views, region(views), path, _cache_gb(views, cache_gb(run.memory_mb)))
         return
     folder = target.parent / FUSING
-    made_from = fingerprint(run.fingerprint, [[view.name, _stamp(dense_dir, view)] for view in views], min_views)
+    stamps = [[view.name, map_file(dense_dir, view).stat().st_mtime_ns] for view in views]
+    made_from = fingerprint(run.fingerprint, stamps, min_views)
     if not resume_or_clear(folder, made_from):
         mark_unfinished(folder, made_from)
     tasks = plan_fusion(dense_dir, views, min_views, folder, run)
@@ -152,7 +153,3 @@ def is_near(view: View, depth: NDArray[np.float32], box: FloatArray) -> NDArray[
         place = ray * depth + np.float32(center)
         near &= (place >= np.float32(box[0, axis]) - beyond) & (place <= np.float32(box[1, axis]) + beyond)
     return near
-
-
-def _stamp(dense_dir: Path, view: View) -> int:
-    return map_file(dense_dir, view).stat().st_mtime_ns

@@ -51,11 +51,6 @@ class Lens:
         if len(self.radial) > (most := 4 if self.projection == "equidistant" else 3):
             raise ConfigError(f"synthetic lens: {self.projection} has at most {most} radial terms")
 
-    @property
-    def k1(self) -> float:
-        """First radial term, 0 without one."""
-        return self.radial[0] if self.radial else 0.0
-
     def rays(self, points: FloatArray) -> FloatArray:
         """Return directions (N, 3) of image points (N, 2), z = 1 with "perspective", else of length 1; NaN without."""
         family, params = self._family, self._params
@@ -107,7 +102,7 @@ class Camera:
     @property
     def radial(self) -> float:
         """k1 of COLMAP's SIMPLE_RADIAL and OPENCV: x_d = x_u (1 + k1 r^2) about the optical center; < 0: barrel."""
-        return self.lens.k1
+        return self.lens.radial[0] if self.lens.radial else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -245,11 +240,6 @@ def look_at(center: FloatArray, aim: FloatArray, roll_deg: float = 0.0) -> Float
     right = _unit(right)
     R = axis_rotation(np.array([0.0, 0.0, 1.0]), roll_deg) @ np.stack([right, np.cross(forward, right), forward])
     return np.column_stack([R, -R @ center])
-
-
-def camera_center(cam_from_world: FloatArray) -> FloatArray:
-    """Return (3,) position in the world of a camera with the (3, 4) pose [R | t]."""
-    return np.asarray(-cam_from_world[:, :3].T @ cam_from_world[:, 3])
 
 
 def axis_rotation(axis: FloatArray, angle_deg: float) -> FloatArray:

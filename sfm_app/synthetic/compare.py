@@ -8,10 +8,11 @@ import numpy as np
 from sfm_app.geometry.poses import Similarity, robust_similarity
 from sfm_app.geometry.triangles import areas
 from sfm_app.meshing.ray_casting import load_open3d
-from sfm_app.synthetic.cameras import Camera, camera_center, pixel_rays
+from sfm_app.synthetic.cameras import Camera, pixel_rays
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.synthetic.render import cast_rays, ray_caster
 from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.scene import camera_center
 
 SAMPLES = 20_000
 """Points sampled on a surface."""

@@ -17,10 +17,11 @@ from sfm_app.errors import InputError
 from sfm_app.files import replace_atomically
 from sfm_app.formats.meshes import triangles
 from sfm_app.progress import Progress, track
-from sfm_app.synthetic.cameras import Camera, Lens, Views, camera_center, check_ranges
+from sfm_app.synthetic.cameras import Camera, Lens, Views, check_ranges
 from sfm_app.synthetic.render import GAMMA, prepare, render_scene
 from sfm_app.synthetic.shapes import SyntheticScene
 from sfm_app.types.arrays import FloatArray
+from sfm_app.types.scene import camera_center
 
 TRUTH_FILE, SURFACE_FILE = "truth.json", "surface.ply"
 

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.meshing.ray_casting import load_open3d
-from sfm_app.synthetic.cameras import Camera, camera_center, pixel_rays
+from sfm_app.synthetic.cameras import Camera, pixel_rays
 from sfm_app.synthetic.shapes import SyntheticScene, mixture
 from sfm_app.types import Surface
 from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.types.scene import camera_center
 from sfm_app.types.surface import Model, Texture
 
 NO_HIT = 0xFFFFFFFF

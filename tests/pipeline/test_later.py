@@ -13,7 +13,7 @@ from sfm_app.colmap.database import photo_names, read_features
 from sfm_app.geometry.poses import robust_similarity
 from sfm_app.settings import Settings
 from sfm_app.stages import scene as scene_stage
-from sfm_app.synthetic.cameras import camera_center
+from sfm_app.types.scene import camera_center
 
 pytestmark = pytest.mark.slow
 

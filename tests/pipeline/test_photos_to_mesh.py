@@ -26,9 +26,9 @@ from sfm_app.runtime.workspace import LOCK, Workspace
 from sfm_app.settings import Settings, merge_nested
 from sfm_app.stages import texture
 from sfm_app.stages.texture import PARTS, FileStore, photo_views
-from sfm_app.synthetic.cameras import camera_center
 from sfm_app.synthetic.compare import center_error_percent, focal_error_percent, surface_errors
 from sfm_app.texture import pages
+from sfm_app.types.scene import camera_center
 
 QUICK = {"quality": "draft", "report": False, "depth": {"max_image_size_px": 360}, "mesh": {"poisson_depth": 8}}
 DRAFT = Settings.from_mapping(QUICK)

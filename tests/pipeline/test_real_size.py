@@ -17,9 +17,10 @@ from sfm_app.frame.markers import draw_pattern
 from sfm_app.geometry.poses import Similarity, umeyama
 from sfm_app.settings import Settings
 from sfm_app.stages import scene as scene_stage
-from sfm_app.synthetic.cameras import ArcOptions, arc, camera_center, make_camera
+from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
 from sfm_app.synthetic.scenes import courtyard
+from sfm_app.types.scene import camera_center
 
 pytestmark = pytest.mark.slow
 

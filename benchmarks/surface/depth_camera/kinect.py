@@ -17,10 +17,11 @@ from benchmarks.surface.depth_camera.scan import Scan, align
 from benchmarks.surface.rendered.truth import sights_of
 from sfm_app.geometry.poses import Similarity
 from sfm_app.meshing.ray_casting import load_open3d
-from sfm_app.synthetic.cameras import Camera, camera_center
+from sfm_app.synthetic.cameras import Camera
 from sfm_app.synthetic.compare import sample_surface, surface_distances
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.types import Surface
+from sfm_app.types.scene import camera_center
 
 FloatArray = NDArray[np.float64]
 ACCURATE_M, COMPLETE_M, FAR_M = 0.03, 0.05, 0.1

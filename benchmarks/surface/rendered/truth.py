@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common.results import Row
-from sfm_app.synthetic.cameras import camera_center
 from sfm_app.synthetic.compare import align_centers, sample_surface, scene_size, surface_distances
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.synthetic.render import cast_rays, ray_caster
 from sfm_app.types import Surface
+from sfm_app.types.scene import camera_center
 
 FloatArray = NDArray[np.float64]
 ACCURATE, COMPLETE, FINE = 0.005, 0.01, 0.001

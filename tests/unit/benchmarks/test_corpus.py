@@ -18,7 +18,8 @@ from benchmarks.corpus.bars import demands, unreported_fold
 from benchmarks.corpus.score import Doubt, claimed_errors, parameter_counts, parameter_errors, walk_figures
 from benchmarks.corpus.trajectory import offset_errors, order_scores
 from sfm_app.camera.models import camera_matrix
-from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at
+from sfm_app.synthetic.cameras import axis_rotation, look_at
+from sfm_app.types.scene import camera_center
 
 K = camera_matrix(1000.0, 1000.0, 400.0, 300.0)
 Y = np.array([0.0, 1.0, 0.0])

@@ -18,8 +18,9 @@ from benchmarks.surface.depth_camera.kinect import (
 from benchmarks.surface.depth_camera.scan import PATCH, Scan, align
 from benchmarks.surface.sets import SCANNED, surface_set
 from sfm_app.geometry.poses import Similarity
-from sfm_app.synthetic.cameras import Camera, axis_rotation, camera_center, look_at
+from sfm_app.synthetic.cameras import Camera, axis_rotation, look_at
 from sfm_app.types import Surface
+from sfm_app.types.scene import camera_center
 from tests.unit.benchmarks.test_surface import joined
 
 CELL = 0.015

@@ -21,8 +21,9 @@ from benchmarks.synthetic.town import (
     town_views,
     walk_town,
 )
-from sfm_app.synthetic.cameras import Camera, camera_center, make_camera, pixel_rays
+from sfm_app.synthetic.cameras import Camera, make_camera, pixel_rays
 from sfm_app.synthetic.render import cast_rays, ray_caster
+from sfm_app.types.scene import camera_center
 from tests.unit.synthetic.test_shapes import signed_volume
 
 

@@ -18,8 +18,9 @@ from benchmarks.synthetic.trouble import (
     with_zoom,
     write_troubled_folder,
 )
-from sfm_app.synthetic.cameras import Views, camera_center, make_camera, pixel_rays
+from sfm_app.synthetic.cameras import Views, make_camera, pixel_rays
 from sfm_app.synthetic.shapes import Body
+from sfm_app.types.scene import camera_center
 
 pytestmark = pytest.mark.slow
 

@@ -7,8 +7,9 @@ from benchmarks.synthetic import walks
 from benchmarks.synthetic.matches import LEAST_DEPARTURE_PX, TownOptions, make_town_graph, make_two_motions
 from sfm_app.errors import ConfigError
 from sfm_app.geometry.epipolar import sampson_distance
-from sfm_app.synthetic.cameras import camera_center, make_camera
+from sfm_app.synthetic.cameras import make_camera
 from sfm_app.synthetic.correspondences import PairOptions
+from sfm_app.types.scene import camera_center
 
 
 def miss_of_axes(views):

@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_app.frame.vanishing_points import Segments, concatenate_segments, segment_planes
-from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at
+from sfm_app.synthetic.cameras import axis_rotation, look_at
+from sfm_app.types.scene import camera_center
 
 FOCAL_PX = 1000.0
 

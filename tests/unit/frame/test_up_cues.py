@@ -17,8 +17,9 @@ from sfm_app.frame.up_cues import (
     slope_asymmetry,
 )
 from sfm_app.frame.up_direction import CUES, OPTIONS, Cue, Scenery, odds, select_roll
-from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at, pixel_rays
+from sfm_app.synthetic.cameras import axis_rotation, look_at, pixel_rays
 from sfm_app.synthetic.render import GAMMA, cast_rays, prepare, render_scene
+from sfm_app.types.scene import camera_center
 
 UP = np.array([0.0, 1.0, 0.0])
 VIEW_AXIS = np.array([0.0, 0.0, 1.0])

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from benchmarks.synthetic.walks import orbit
 from sfm_app.errors import ConfigError
 from sfm_app.synthetic import cameras
+from sfm_app.types.scene import camera_center
 
 COORDINATES = st.floats(-5, 5)
 
@@ -18,7 +19,7 @@ def test_a_camera_sees_its_aim_in_the_middle(x, y, z, roll):
     pose = cameras.look_at(center, aim, roll)
     R, t = pose[:, :3], pose[:, 3]
     assert np.allclose(R @ R.T, np.eye(3)) and np.linalg.det(R) == pytest.approx(1.0)
-    assert np.allclose(cameras.camera_center(pose), center)
+    assert np.allclose(camera_center(pose), center)
     assert np.allclose(R @ aim + t, [0, 0, np.linalg.norm(aim - center)], atol=1e-9)
 
 
@@ -57,7 +58,7 @@ def test_distortion_that_folds_within_the_photo_is_refused(share):
 def miss_of_axes(views):
     """(N,) how far each optical axis passes the point that is nearest to all of them."""
     poses = np.array(list(views.cam_from_world.values()))
-    centers = np.array([cameras.camera_center(pose) for pose in poses])
+    centers = np.array([camera_center(pose) for pose in poses])
     axes = poses[:, 2, :3]
     away = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     meeting = np.linalg.solve(away.sum(axis=0), np.einsum("nij,nj->i", away, centers))
@@ -68,7 +69,7 @@ def miss_of_axes(views):
 def test_an_arc_is_no_orbit(seed):
     options = cameras.ArcOptions()
     views = cameras.arc(cameras.make_camera(96, 64), options, seed)
-    centers = np.array([cameras.camera_center(pose) for pose in views.cam_from_world.values()])
+    centers = np.array([camera_center(pose) for pose in views.cam_from_world.values()])
     ground_distance = np.hypot(centers[:, 0], centers[:, 2])
 
     assert list(views.cam_from_world) == [f"view_{k:02d}.jpg" for k in range(12)] == list(views.cameras)

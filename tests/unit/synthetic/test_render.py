@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from sfm_app.synthetic import render
-from sfm_app.synthetic.cameras import Camera, camera_center, look_at, make_camera, pixel_rays
+from sfm_app.synthetic.cameras import Camera, look_at, make_camera, pixel_rays
 from sfm_app.synthetic.shapes import Body, Material, SyntheticScene, box
 from sfm_app.types import Surface
+from sfm_app.types.scene import camera_center
 from sfm_app.types.surface import Model, Texture
 
 pytestmark = pytest.mark.slow
