@@ -29,8 +29,9 @@ from sfm_app.colmap.surface import FUSED, open_points, positions
 from sfm_app.colmap.wide_views import ViewNames, WideLens, render_views, save_picture
 from sfm_app.engine.stage import Products, Stage, check_undamaged, resume_hint
 from sfm_app.errors import InputError
-from sfm_app.files import RECORD, recorded_files, replace_atomically, replace_folder
+from sfm_app.files import RECORD, read_object, recorded_files, replace_atomically, replace_folder, save_files
 from sfm_app.formats.scenes import plain_names
+from sfm_app.frame.coordinates import MapFrame
 from sfm_app.frame.scale import GPS, MetricFrame, move_model
 from sfm_app.frame.sighted_points import Distance, PosedPhotos, measure_distance
 from sfm_app.geometry.poses import Similarity
@@ -53,8 +54,24 @@ def stored_frame(run: RunContext) -> MetricFrame:
     if run.workspace.manifest.record(SCALE.name) is not None:
         return Products(run)[SCALE]
     known = run.workspace.manifest.record(SCENE.name) is not None
-    deviation = Products(run)[SCENE].gps_deviation if known else None
-    return MetricFrame() if deviation is None else MetricFrame(deviation=deviation, source=GPS)
+    scene = Products(run)[SCENE] if known else None
+    if scene is None or scene.gps_deviation is None:
+        return MetricFrame()
+    return MetricFrame(deviation=scene.gps_deviation, source=GPS, place=scene.gps_place)
+
+
+def stored_map(run: RunContext) -> MapFrame | None:
+    """Return the frame of a run's exports on the map; None if its place is unknown."""
+    place = stored_frame(run).place
+    return MapFrame(place) if place else None
+
+
+def record_map(run: RunContext, folder: Path) -> None:
+    """Write the place of exported files on the map into the record beside them, and remove that of an earlier run."""
+    known, here = read_object(folder / RECORD), stored_map(run)
+    record = {key: value for key, value in known.items() if key != "map"} | ({"map": here.to_dict()} if here else {})
+    if record != known:
+        save_files({RECORD: json_text(record).encode()}, folder)
 
 
 def export_frame(run: RunContext) -> Similarity | None:
@@ -149,6 +166,7 @@ class StoredScene:
     def __init__(self, run: RunContext) -> None:
         self._run = run
         self.scene, self._model = stored_scene(run)
+        self.map = stored_map(run)
         self.images = dict[str, str]()
         """Photo by name of its file, of all photos written so far."""
 
@@ -175,7 +193,7 @@ class StoredScene:
             "format": file_format,
             "photo_of": {image: paths.get(photo, photo) for image, photo in self.images.items()},
             "unregistered": {paths.get(photo, photo): why for photo, why in self.scene.unregistered.items()},
-        }
+        } | ({"map": self.map.to_dict()} if self.map else {})
 
     def say(self, text: str) -> None:
         """Show the user a message."""

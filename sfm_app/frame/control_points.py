@@ -19,7 +19,7 @@ from sfm_app.frame.coordinates import GPS_SYSTEM, CoordinateSystem, LocalFrame, 
 from sfm_app.frame.sighted_points import SightedPoint
 from sfm_app.geometry.poses import Similarity, robust_similarity, umeyama
 from sfm_app.numerical import FAILURES
-from sfm_app.types import ControlPoint, ControlPoints, GpsPosition
+from sfm_app.types import ControlPoint, ControlPoints, GpsPosition, MapPlace
 from sfm_app.types.arrays import FloatArray
 from sfm_app.wording import format_length
 
@@ -194,6 +194,7 @@ class ControlFit:
     inliers: tuple[str, ...]
     outliers: Mapping[str, float]
     """Distance of each rejected point from the fit, in meters."""
+    place: MapPlace
 
 
 def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]) -> ControlFit | str:
@@ -211,9 +212,18 @@ def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]
     outliers = {name: float(miss) for name, inlier, miss in zip(names, used, distances, strict=True) if not inlier}
     marks = fit.scale * _mark_deviation([located[name] for name in inliers])
     deviation = max(_sigma(distances[used]), marks, MIN_SIGMA_M) / float(np.sqrt(used.sum())) / placed.spread(used)
-    east, north, up = frame.origin.tolist() if frame.has_grid else (0.0, 0.0, 0.0)
-    units = frame.units_per_m if frame.has_grid else (1.0, 1.0)
-    return ControlFit(fit, frame.describe(), (east, north, up), units, deviation, placed.miss(used), inliers, outliers)
+    x, y, z = frame.origin.tolist()
+    return ControlFit(
+        fit,
+        frame.describe(),
+        (x, y, z) if frame.has_grid else (0.0, 0.0, 0.0),
+        frame.units_per_m if frame.has_grid else (1.0, 1.0),
+        deviation,
+        placed.miss(used),
+        inliers,
+        outliers,
+        MapPlace(given.crs, (x, y, z)),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from sfm_app.errors import NumericalError
+from sfm_app.types import MapPlace
 from sfm_app.types.arrays import FloatArray
 
 GPS_SYSTEM = "EPSG:4979"
@@ -31,6 +32,8 @@ class CoordinateSystem:
         """`text` is the name for people, `crs` that of pyproj."""
         from pyproj import Transformer
 
+        self.given = crs
+        crs = _unbound(crs)
         parts = [_unbound(part) for part in crs.sub_crs_list] if crs.is_compound else [crs]
         self.crs, axes = parts[0], parts[0].axis_info
         self.is_flat: bool = self.crs.is_engineering
@@ -134,10 +137,14 @@ class LocalFrame:
 
     def positions(self, points: FloatArray) -> FloatArray:
         """Return points (N, 3) of the frame as positions in the system."""
+        return self.system.positions(self.geocentric_m(points))
+
+    def geocentric_m(self, points: FloatArray) -> FloatArray:
+        """Return points (N, 3) of the frame as those of the system's `geocentric_m`."""
         if self.system.is_flat:
-            return self.system.positions(points + self.center)
+            return np.asarray(points + self.center)
         x, y, z = (points @ self._turn).T
-        return self.system.positions(np.column_stack(self._topocentric.transform(x, y, z, direction="INVERSE")))
+        return np.column_stack(self._topocentric.transform(x, y, z, direction="INVERSE"))
 
     def describe(self) -> str:
         """Return the grid, or the place of the origin, for people."""
@@ -158,6 +165,48 @@ class LocalFrame:
             self._turn = np.array([[c.real, -c.imag, 0.0], [c.imag, c.real, 0.0], [0.0, 0.0, 1.0]])
 
 
+class MapFrame:
+    """A frame in meters with y up on a map: the projected system of its place, else the zone of UTM on its datum."""
+
+    def __init__(self, place: MapPlace) -> None:
+        self._local = LocalFrame(read_system(place.system), np.array(place.origin))
+        cosine, sine = np.cos(np.radians(place.heading_deg)), np.sin(np.radians(place.heading_deg))
+        self._turn = np.array([[cosine, -sine, 0.0], [0.0, 0.0, 1.0], [-sine, -cosine, 0.0]])
+        known = self._local.system
+        self._system = known if known.crs.is_projected or known.is_flat else _utm(known, self._local.center)
+        self.crs = None if known.is_flat else self._system.given
+        """That of pyproj; None for axes of the user's own."""
+
+    def positions(self, points: FloatArray) -> FloatArray:
+        """Return points (N, 3) of the frame on the map: x east, y north, z up, in units of the system."""
+        return self._system.positions(self._local.geocentric_m(points @ self._turn))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the system, the offset, and the linear map of points near (0, 0, 0) as plain values.
+
+        The Earth bends away from it, by 1 mm at 110 m.
+        """
+        offset = self.positions(np.zeros((1, 3)))[0]
+        linear = (self.positions(np.eye(3)) - self.positions(-np.eye(3))).T / 2.0
+        matrix = np.vstack([np.column_stack([linear, offset]), [0.0, 0.0, 0.0, 1.0]])
+        return {"system": self._system.name, "offset": offset.tolist(), "transform": matrix.tolist()}
+
+
+def _utm(system: CoordinateSystem, center: FloatArray) -> CoordinateSystem:
+    """Return the zone of UTM of a geocentric point (3,), on the datum of a system: no shift between datums is needed."""
+    from pyproj.crs import GeographicCRS, ProjectedCRS
+    from pyproj.crs.coordinate_operation import UTMConversion
+
+    longitude, latitude, _ = np.degrees(system.geodetic(center[None])[0])
+    zone, side = int((longitude + 180.0) // 6.0) % 60 + 1, "N" if latitude >= 0.0 else "S"
+    if system.crs.geodetic_crs.name == "WGS 84":
+        return read_system(f"EPSG:{(32600 if side == 'N' else 32700) + zone}")
+    base = GeographicCRS(name=system.crs.geodetic_crs.name, datum=system.crs.datum)
+    name = f"{base.name} / UTM zone {zone}{side}"
+    crs = ProjectedCRS(UTMConversion(zone, hemisphere=side), name=name, geodetic_crs=base)
+    return CoordinateSystem(crs.to_wkt(), crs)
+
+
 @lru_cache(maxsize=64)
 def read_system(text: str) -> CoordinateSystem:
     """Read a code, a PROJ string, WKT, a name or `local`; a ValueError says that PROJ knows no such system."""
@@ -173,7 +222,7 @@ def read_system(text: str) -> CoordinateSystem:
         # PROJ also takes names that merely resemble its own
         if not re.search(r"[:=\[{]|^\d+$", code) and _letters(crs.name) != _letters(code):
             raise ValueError(f"{unknown}; the nearest name is '{crs.name}'")
-        return CoordinateSystem(text, _unbound(crs))
+        return CoordinateSystem(text, crs)
     except (pyproj.exceptions.ProjError, RecursionError):  # JSON may be nested
         raise ValueError(unknown) from None
 

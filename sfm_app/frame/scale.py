@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sfm_app.geometry.poses import Similarity
-from sfm_app.types import Model, PosedPhoto
+from sfm_app.types import MapPlace, Model, PosedPhoto
 
 GPS = "GPS of the photos"
 CONTRADICTION = 4.0
@@ -46,6 +46,8 @@ class MetricFrame:
     """Position of the frame's origin in that system: x is east, y up and z south of it."""
     units_per_m: tuple[float, float] = (1.0, 1.0)
     """Units of that system per meter, horizontal and vertical."""
+    place: MapPlace | None = None
+    """Place of the frame, by ground control points or else GPS."""
 
     @property
     def is_metric(self) -> bool:
@@ -81,7 +83,16 @@ class MetricFrame:
             values["crs"],
             (east, north, up),
             (horizontal, vertical),
+            read_place(values["place"]),
         )
+
+
+def read_place(values: Mapping[str, Any] | None) -> MapPlace | None:
+    """Return the place of `asdict`, also by way of JSON."""
+    if not values:
+        return None
+    x, y, z = map(float, values["origin"])
+    return MapPlace(values["system"], (x, y, z), float(values["heading_deg"]))
 
 
 def agree(evidence: Sequence[ScaleEvidence], shape: float = 0.0) -> MetricFrame:

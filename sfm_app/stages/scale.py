@@ -45,7 +45,7 @@ def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
     # the proportions are as exact as the least exact focal length
     shares = (one.deviations.get("fx", 0.0) / one.K[0, 0] for one in scene.cameras.values())
     shape = float(max((share for share in shares if np.isfinite(share)), default=0.0))
-    frame = _agreed_frame(evidence, control, shape)
+    frame = replace(_agreed_frame(evidence, control, shape), place=control.place if control else scene.gps_place)
     run.record(
         unit="meter" if frame.is_metric else "arbitrary",
         scale=frame.from_model.scale,
