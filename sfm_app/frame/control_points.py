@@ -48,7 +48,7 @@ def read_control_points(path: Path, files: Collection[str] = ()) -> ControlPoint
     try:
         lines = [(number, line.strip()) for number, line in enumerate(read_text(path, MOST_BYTES).splitlines(), 1)]
         lines = [line for line in lines if line[1] and not line[1].startswith("#")]
-        system, header = _read_header(lines)
+        system, header = read_header(lines)
         points = _read_marks(lines, system, files)
         if not points:
             raise ValueError("it holds no point")
@@ -61,8 +61,8 @@ def read_control_points(path: Path, files: Collection[str] = ()) -> ControlPoint
     return ControlPoints(points, header, str(path), fingerprint(header, content))
 
 
-def _read_header(lines: list[tuple[int, str]]) -> tuple[CoordinateSystem, str]:
-    """Take the coordinate system from the lines; WKT may have several."""
+def read_header(lines: list[tuple[int, str]]) -> tuple[CoordinateSystem, str]:
+    """Take the coordinate system from numbered lines; WKT may have several. ValueError if PROJ does not know it."""
     if not lines:
         raise ValueError("it names no coordinate system")
     number, header = lines.pop(0)
@@ -82,19 +82,19 @@ Position = tuple[float, float, float]
 def _read_marks(
     lines: Sequence[tuple[int, str]], system: CoordinateSystem, files: Collection[str]
 ) -> tuple[ControlPoint, ...]:
-    index, missing = _index_files(files), list[str]()
+    index, missing = index_files(files), list[str]()
     names: dict[Position, str] = {}
     positions: dict[str, Position] = {}
     marks: dict[str, dict[str, tuple[float, float]]] = {}
     for number, line in lines:
         try:
             position, mark, tails = _read_mark(line)
-            photo, name, is_there = _find_photo(tails, index)
+            photo, name, is_there = find_photo(tails, index)
         except ValueError as err:
             raise ValueError(f"line {number} {err}") from None
         name = name or names.setdefault(position, f"point {len(names) + 1}")
         if name not in positions:
-            _check_position(position, system, number)
+            check_position(position, system, number)
         if positions.setdefault(name, position) != position:
             raise ValueError(f"line {number} gives '{name}' another position than an earlier line")
         marks.setdefault(name, {})[photo] = mark
@@ -123,7 +123,8 @@ def _read_mark(line: str) -> tuple[Position, tuple[float, float], list[tuple[str
     return (x, y, z), (column, row), tails[::-1]
 
 
-def _check_position(position: Position, system: CoordinateSystem, line: int) -> None:
+def check_position(position: Position, system: CoordinateSystem, line: int) -> None:
+    """Raise a ValueError if a system has no such position; it says whether swapped columns would be one."""
     x, y, z = position
     there, swapped = np.isfinite(system.geocentric_m(np.array([[x, y, z], [y, x, z]]))[:, 0])
     if not there:
@@ -131,8 +132,8 @@ def _check_position(position: Position, system: CoordinateSystem, line: int) -> 
         raise ValueError(f"line {line} has a position out of range of the system {system.name}{advice}")
 
 
-def _index_files(files: Collection[str]) -> tuple[dict[str, list[str]], ...]:
-    """Return files by what marks may call them: path, name, name in other case, the same without suffix."""
+def index_files(files: Collection[str]) -> tuple[dict[str, list[str]], ...]:
+    """Return files by what users may call them: path, name, name in other case, the same without suffix."""
     index: tuple[dict[str, list[str]], ...] = ({}, {}, {}, {})
     for file in files:
         path = PurePosixPath(file)
@@ -143,7 +144,7 @@ def _index_files(files: Collection[str]) -> tuple[dict[str, list[str]], ...]:
     return index
 
 
-def _find_photo(
+def find_photo(
     tails: Sequence[tuple[str, str]], index: Sequence[Mapping[str, Sequence[str]]]
 ) -> tuple[str, str, bool]:
     """Return the photo of a mark, the name of its point, and whether the photo is a file of the folder.

@@ -87,6 +87,16 @@ class CoordinateSystem:
         x, y, z = points.T
         return np.column_stack(self._cart.transform(x, y, z, radians=True, direction="INVERSE"))
 
+    def to_wgs84(self, positions: FloatArray) -> FloatArray:
+        """Return longitude, latitude in degrees and height (N, 3); heights change their unit only."""
+        from pyproj import Transformer
+
+        if self.crs.is_geocentric:
+            return np.asarray(self.geodetic(self.geocentric_m(positions)) * [*2 * [180.0 / np.pi], 1.0])
+        flat = self.crs if self.given.is_compound else self.given.to_2d()
+        change = Transformer.from_crs(flat, "EPSG:4326", always_xy=True)
+        return np.column_stack([*change.transform(*positions[:, :2].T), positions[:, 2] * self.z_m])
+
     def degrees_outside(self, point: FloatArray) -> float:
         """Return how far a geocentric point (3,) lies outside of the area for which the system is made; 0 inside."""
         area = self.crs.area_of_use

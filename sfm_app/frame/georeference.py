@@ -11,6 +11,7 @@ from sfm_app.geometry.poses import Similarity, draw_pairs, perpendicular_basis, 
 from sfm_app.numerical import FAILURES, MAD_TO_SIGMA
 from sfm_app.types import GpsPosition, Rejected
 from sfm_app.types.arrays import FloatArray
+from sfm_app.types.photos import FILE
 
 MIN_POSITIONS = 3
 """Least number of distinct positions that must agree."""
@@ -86,9 +87,9 @@ def georeference(
     rms_m = fit.rms_m if isinstance(fit, Georeference) else np.inf
     if isinstance(other, Georeference) and OPTIONS.min_swap_gain * other.rms_m < min(rms_m, _width(swapped)):
         now = f"they miss by {rms_m:.2g} m" if fit else "they do not agree"
-        return Rejected(
-            f"latitude and longitude are probably swapped: {now}, and swapped by {other.rms_m:.2g} m; correct the EXIF"
-        )
+        place = "file of positions" if given[0].zero == FILE else "EXIF"
+        swap = "latitude and longitude are probably swapped"
+        return Rejected(f"{swap}: {now}, and swapped by {other.rms_m:.2g} m; correct the {place}")
     return fit
 
 

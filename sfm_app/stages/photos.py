@@ -178,7 +178,8 @@ def _read_photos(
             hint="at least two photos of a place are needed; 10 to 50 work best",
             photos={photo.name: photo.reason for photo in unusable},
         )
-    timed = [replace(photo, time_s=times_s.get(photo.path)) for photo in with_one_zero(photos)]
+    known = [replace(photo, gps=source.positions.get(photo.path, photo.gps)) for photo in photos]
+    timed = [replace(photo, time_s=times_s.get(photo.path)) for photo in with_one_zero(known)]
     named = tuple(split_by_given_camera(list(assign_names(group_by_camera(timed, options.cameras))), run.given))
     photo_set = PhotoSet(folder, named, tuple(unusable), source.mask_dir)
     for place in (run.workspace.photos, run.workspace.masks):
@@ -192,7 +193,7 @@ def _read_photos(
     write_photo_list(photo_set, copies, run.workspace)
     run.record(usable=len(photos), cameras=len(photo_set.groups), unusable={p.name: p.reason for p in unusable})
     run.record(notes={photo.path: list(photo.notes) for photo in photos if photo.notes})
-    run.record(gps=sum(photo.gps is not None for photo in photos))
+    run.record(gps=sum(photo.gps is not None for photo in timed))
     return photo_set
 
 

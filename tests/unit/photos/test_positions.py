@@ -41,7 +41,7 @@ def exif_with(seconds=None, altitude=None):
 
 
 def read(tmp_path, xmp, name="a.jpg", exif=None):
-    place, options = tmp_path / name, {"exif": exif} if exif else {}
+    place, options = tmp_path / name, {} if exif is None else {"exif": exif}
     if name.endswith(".png"):
         from PIL.PngImagePlugin import PngInfo
 
