@@ -144,9 +144,7 @@ def index_files(files: Collection[str]) -> tuple[dict[str, list[str]], ...]:
     return index
 
 
-def find_photo(
-    tails: Sequence[tuple[str, str]], index: Sequence[Mapping[str, Sequence[str]]]
-) -> tuple[str, str, bool]:
+def find_photo(tails: Sequence[tuple[str, str]], index: Sequence[Mapping[str, Sequence[str]]]) -> tuple[str, str, bool]:
     """Return the photo of a mark, the name of its point, and whether the photo is a file of the folder.
 
     `tails` are pairs of both, the longest photo first. A ValueError says that several photos fit equally well.

@@ -203,7 +203,7 @@ class MapFrame:
 
 
 def _utm(system: CoordinateSystem, center: FloatArray) -> CoordinateSystem:
-    """Return the zone of UTM of a geocentric point (3,), on the datum of a system: no shift between datums is needed."""
+    """Return the zone of UTM of a geocentric point (3,), on the datum of a system, which avoids a shift."""
     from pyproj.crs import GeographicCRS, ProjectedCRS
     from pyproj.crs.coordinate_operation import UTMConversion
 

@@ -80,9 +80,7 @@ def georeference(
     fit = _fit_positions(cameras, given, up, up_is_sure)
     if max(abs(one.longitude_deg) for one in given) > 90.0:
         return fit
-    swapped = [
-        replace(one, latitude_deg=one.longitude_deg, longitude_deg=one.latitude_deg) for one in given
-    ]
+    swapped = [replace(one, latitude_deg=one.longitude_deg, longitude_deg=one.latitude_deg) for one in given]
     other = _fit_positions(cameras, swapped, up, up_is_sure)
     rms_m = fit.rms_m if isinstance(fit, Georeference) else np.inf
     if isinstance(other, Georeference) and OPTIONS.min_swap_gain * other.rms_m < min(rms_m, _width(swapped)):

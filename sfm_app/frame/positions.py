@@ -1,4 +1,4 @@
-"""Positions of photos from a file of the user: OpenDroneMap's geo.txt, or a table as Metashape and RealityCapture do."""
+"""Positions of photos from a file: OpenDroneMap's geo.txt, or a table of Metashape or RealityCapture."""
 
 import math
 import re
@@ -64,9 +64,7 @@ def read_positions(path: Path, files: Collection[str]) -> tuple[dict[str, GpsPos
         raise InputError(f"{path} holds no positions of photos: {err}", hint=FORM) from err
 
 
-def _read_line(
-    line: str, index: Sequence[dict[str, list[str]]], *, is_table: bool
-) -> tuple[str, list[float], bool]:
+def _read_line(line: str, index: Sequence[dict[str, list[str]]], *, is_table: bool) -> tuple[str, list[float], bool]:
     """Return the photo of a line, its numbers, and whether the photo is a file of the folder."""
     divider = next((sign for sign in "\t;," if line.count(sign) >= 2), None)
     if divider:

@@ -109,9 +109,9 @@ def gps_position(exif: Image.Exif, xmp: Mapping[str, str] = MappingProxyType({})
     longitude = _degrees(given[1], entries.get(GPS.GPSLongitudeRef), "EW", 180.0)
     north = _xmp_degrees(drone.get("gpslatitude", ""), "NS", 90.0)
     east = _xmp_degrees(drone.get("gpslongitude") or drone.get("gpslongtitude", ""), "EW", 180.0)  # DJI misspelt it
-    if north and east:
-        if latitude is None or longitude is None or max(north[1], east[1]) < max(map(_step_deg, given)):
-            latitude, longitude = north[0], east[0]
+    known = latitude is not None and longitude is not None
+    if north and east and not (known and max(north[1], east[1]) >= max(map(_step_deg, given))):
+        latitude, longitude = north[0], east[0]
     if latitude is None or longitude is None or latitude == longitude == 0.0:
         return None
     altitude, zero = _find_altitude(entries, drone)
@@ -133,7 +133,9 @@ def _find_altitude(entries: Mapping[int, Any], drone: Mapping[str, str]) -> tupl
 
 DRONES = ("drone-dji:", "drone-parrot:", "Camera:", "sensefly:", "exif:")
 """Prefixes of positions in XMP: DJI, Parrot, Pix4D for senseFly, Parrot and MicaSense, and EXIF's own names."""
-XMP_DEGREES = re.compile(r"([+-]?\d{1,3}(?:\.\d+)?)(?:,(\d{1,2}(?:\.\d+)?))?(?:,(\d{1,2}(?:\.\d+)?))? ?([NSEW]?)", re.ASCII)
+XMP_DEGREES = re.compile(
+    r"([+-]?\d{1,3}(?:\.\d+)?)(?:,(\d{1,2}(?:\.\d+)?))?(?:,(\d{1,2}(?:\.\d+)?))? ?([NSEW]?)", re.ASCII
+)
 """Degrees with a sign, or degrees, minutes and perhaps seconds with the letter of the hemisphere."""
 XMP_ENTRY = re.compile(
     rb"""<([\w-]{1,40}:\w{1,60})\s{0,9}>([^<]{0,200})</|([\w-]{1,40}:\w{1,60})\s{0,9}=\s{0,9}["']([^"'<]{0,200})["']"""
@@ -146,7 +148,7 @@ MOST_XMP_BYTES = 262_144
 def xmp_entries(image: Image.Image, exif: Image.Exif | None = None) -> dict[str, str]:
     """Return the texts of a decoded picture's XMP, or that of its EXIF, by prefix and name; empty without."""
     keys = ("xmp", "XML:com.adobe.xmp")  # older versions of Pillow call that of PNG so
-    xmp = next((image.info[key] for key in keys if image.info.get(key)), None) or (exif or {}).get(Base.XMLPacket)
+    xmp = next((image.info[key] for key in keys if image.info.get(key)), None) or (exif.get(Base.XMLPacket) if exif else None)
     data = xmp.encode() if isinstance(xmp, str) else xmp if isinstance(xmp, bytes) else b""
     entries = ((a or c, b or d) for a, b, c, d in XMP_ENTRY.findall(data[:MOST_XMP_BYTES]))
     return {name.decode(): value.decode(errors="replace").strip() for name, value in entries}

@@ -50,7 +50,9 @@ class Source:
     @property
     def fingerprint(self) -> str:
         """Hash of the path, the files and the masks."""
-        return fingerprint(str(self.path.resolve()), self.files, self.left_out, self.masks, self.one_mask, self.positions)
+        return fingerprint(
+            str(self.path.resolve()), self.files, self.left_out, self.masks, self.one_mask, self.positions
+        )
 
     def content_hash(self, photos: PhotoSet) -> str:
         """Return a hash of the used photos and their masks, without camera groups, which do not affect features."""

@@ -1,9 +1,11 @@
 """Real size by markers, distances and ground control points, from photos to exported files."""
 
 import json
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
+import laspy
 import numpy as np
 import pycolmap
 import pytest
@@ -206,3 +208,34 @@ def test_markers_that_are_not_there_leave_the_unit_as_it_was(measured):
     assert run.manifest["stages"]["scale"]["counts"]["problems"] == [
         "no photo shows a marker; print a page of them with `sfm-app markers`"
     ]
+
+
+def test_a_file_of_positions_puts_the_cloud_on_the_map(measured, tmp_path):
+    """The scene counts as 20 times as large, so that GPS determines its size."""
+    photos, out = shutil.copytree(measured.photos, tmp_path / "photos"), tmp_path / "out"
+    true = {name: 20.0 * camera_center(pose) for name, pose in measured.truth.cam_from_world.items()}
+    lines = [f"{name} {' '.join(f'{x:.3f}' for x in to_utm(place))}" for name, place in sorted(true.items())]
+    (photos / "geo.txt").write_text("\n".join(["EPSG:32632", *lines, "gone.jpg 500000 4649000 320"]), encoding="utf-8")
+    small = {"depth": {"max_image_size_px": 160}, "matching": {"max_image_size_px": 480}, "mesh": {"faces": 1000}}
+    settings = Settings.from_mapping({"quality": "draft", "report": False, **small})
+    said = []
+    run = sfm_app.reconstruct(photos, out, settings, last="mesh", progress=lambda step: said.append(step.label))
+    assert any("gone.jpg" in text for text in said)
+    assert run.manifest["stages"]["photos"]["counts"]["gps"] == len(true)
+    assert not run.manifest["stages"]["photos"]["counts"]["unusable"]
+
+    sfm_app.export_model(out, target=tmp_path / "files" / "points.glb", points=True)
+    here = json.loads((tmp_path / "files" / "export.json").read_text())["map"]
+    assert here["system"] == "EPSG:32632"
+    cameras = run.scene.arrays
+    centers = np.column_stack([cameras.centers, np.ones(len(cameras.photos))]) @ np.array(here["transform"]).T
+    wanted = np.array([to_utm(true[name]) for name in cameras.photos])
+    assert np.abs(centers[:, :3] - wanted).max() < 0.3
+
+    cloud, plain = (sfm_app.export_scene(out, name, tmp_path / "files") for name in ("laz", "cloud-ply"))
+    near = np.array(trimesh.load(plain).vertices, np.float64)
+    mapped = np.column_stack([near, np.ones(len(near))]) @ np.array(here["transform"]).T
+    read = laspy.read(cloud)
+    assert np.abs(read.xyz - mapped[:, :3]).max() < 0.001 + 1e-6 * np.abs(near).max()
+    assert read.header.parse_crs().to_epsg() == 32632
+    assert np.ptp(read.z) < np.ptp(read.x)  # z is up

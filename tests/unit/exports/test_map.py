@@ -132,7 +132,7 @@ def test_axes_of_the_user_give_coordinates_without_a_system(placed):
 
 
 def test_models_stay_near_zero_with_their_place_beside_them(placed):
-    out, points = placed(MapPlace("EPSG:4979", (LON, LAT, HEIGHT), 30.0))
+    out, _ = placed(MapPlace("EPSG:4979", (LON, LAT, HEIGHT), 30.0))
     cloud = sfm_app.export_scene(out, "cloud-ply", out / "files" / "cloud.ply")
     record = json.loads((cloud.parent / "export.json").read_text())
     assert record["map"]["system"] == "EPSG:32632" and "files" not in record

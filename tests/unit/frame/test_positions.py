@@ -1,7 +1,5 @@
 """Files of positions of photos: OpenDroneMap's geo.txt, and tables of other programs."""
 
-import random
-
 import numpy as np
 import pytest
 
@@ -32,10 +30,7 @@ def read(tmp_path, text, files=FILES, encoding="utf-8"):
 def test_spellings_of_the_file(tmp_path, text, encoding):
     found, missing = read(tmp_path, text, encoding=encoding)
     assert not missing
-    assert found == {
-        "a.jpg": GpsPosition(46.5, 9.5, 400.0, FILE),
-        "sub/b 1.jpg": GpsPosition(46.6, 9.6, 410.0, FILE),
-    }
+    assert found == {"a.jpg": GpsPosition(46.5, 9.5, 400.0, FILE), "sub/b 1.jpg": GpsPosition(46.6, 9.6, 410.0, FILE)}
 
 
 @pytest.mark.parametrize(
@@ -91,13 +86,13 @@ def test_wrong_files_are_refused_with_the_line(tmp_path, text, says):
 
 
 def test_damaged_files_are_refused_or_give_positions(tmp_path):
-    rng, refused = random.Random(5), 0
+    rng, refused = np.random.default_rng(5), 0
+    signs = list("0123456789.,;-+eE \t\n#:ajpgnl\x00é")
     sound = "EPSG:32632\na.jpg 500123.5 5149034.1 400.2 1 2 3 0.02 0.05\nsub/b 1.jpg 500133.5 5149035.1 401 1 2 3 1 1\n"
     for _ in range(200):
         text = list(sound)
-        for _ in range(rng.randint(1, 8)):
-            at = rng.randrange(len(text))
-            text[at : at + rng.randint(0, 4)] = rng.choices("0123456789.,;-+eE \t\n#:ajpgnl\x00é", k=rng.randint(0, 4))
+        for at in rng.integers(0, len(sound) - 30, rng.integers(1, 9)):
+            text[at : at + rng.integers(0, 5)] = rng.choice(signs, rng.integers(0, 5))
         try:
             found, _ = read(tmp_path, "".join(text))
         except InputError:
