@@ -32,7 +32,7 @@ from sfm_app.errors import InputError
 from sfm_app.files import RECORD, read_object, recorded_files, replace_atomically, replace_folder, save_files
 from sfm_app.formats.scenes import plain_names
 from sfm_app.frame.coordinates import MapFrame
-from sfm_app.frame.scale import GPS, MetricFrame, move_model
+from sfm_app.frame.scale import GPS, MetricFrame, map_entry, move_model
 from sfm_app.frame.sighted_points import Distance, PosedPhotos, measure_distance
 from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import json_text
@@ -60,16 +60,10 @@ def stored_frame(run: RunContext) -> MetricFrame:
     return MetricFrame(deviation=scene.gps_deviation, source=GPS, place=scene.gps_place)
 
 
-def stored_map(run: RunContext) -> MapFrame | None:
-    """Return the frame of a run's exports on the map; None if its place is unknown."""
-    place = stored_frame(run).place
-    return MapFrame(place) if place else None
-
-
 def record_map(run: RunContext, folder: Path) -> None:
     """Write the place of exported files on the map into the record beside them, and remove that of an earlier run."""
-    known, here = read_object(folder / RECORD), stored_map(run)
-    record = {key: value for key, value in known.items() if key != "map"} | ({"map": here.to_dict()} if here else {})
+    known = read_object(folder / RECORD)
+    record = {key: value for key, value in known.items() if key != "map"} | map_entry(stored_frame(run).place)
     if record != known:
         save_files({RECORD: json_text(record).encode()}, folder)
 
@@ -166,7 +160,7 @@ class StoredScene:
     def __init__(self, run: RunContext) -> None:
         self._run = run
         self.scene, self._model = stored_scene(run)
-        self.map = stored_map(run)
+        self._place = stored_frame(run).place
         self.images = dict[str, str]()
         """Photo by name of its file, of all photos written so far."""
 
@@ -177,6 +171,14 @@ class StoredScene:
     def cloud(self) -> PointCloud:
         """Return the dense cloud."""
         return stored_cloud(self._run)
+
+    def cloud_on_map(self) -> tuple[PointCloud, str]:
+        """Return the dense cloud, z up in a system, and its WKT; as in `cloud` and empty where the place is unknown."""
+        cloud = self.cloud()
+        if self._place is None:
+            return cloud, ""
+        here = MapFrame(self._place)
+        return PointCloud(here.positions(cloud.points), cloud.colors), here.wkt
 
     def perspective(self, *, centered: bool = False) -> "StoredPhotos":
         """Return the undistorted photos; `centered` puts the optical center in the middle."""
@@ -193,7 +195,8 @@ class StoredScene:
             "format": file_format,
             "photo_of": {image: paths.get(photo, photo) for image, photo in self.images.items()},
             "unregistered": {paths.get(photo, photo): why for photo, why in self.scene.unregistered.items()},
-        } | ({"map": self.map.to_dict()} if self.map else {})
+            **map_entry(self._place),
+        }
 
     def say(self, text: str) -> None:
         """Show the user a message."""

@@ -6,14 +6,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.errors import ReconstructionError
 from sfm_app.types import Model, Scene, Texture
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import IndexArray
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
 
 INSTALL_HINT = "pip install 'sfm-app[export]'"
@@ -44,16 +44,6 @@ class Exporter:
     """Whether it stores points and cameras, too."""
 
 
-class MapFrame(Protocol):
-    """A frame on the map."""
-
-    crs: Any
-    """Projected system of pyproj; None for axes of the user's own."""
-
-    def positions(self, points: FloatArray, /) -> FloatArray:
-        """Return points (N, 3) on the map: x east, y north, z up, in units of the system."""
-
-
 class PerspectiveScene(Protocol):
     """The photos of a scene as pinhole cameras, at full size."""
 
@@ -78,15 +68,14 @@ class FinishedScene(Protocol):
     def scene(self) -> Scene:
         """Cameras and poses; `model_dir` is COLMAP's model in the run's own frame."""
 
-    @property
-    def map(self) -> MapFrame | None:
-        """The frame on the map; None if its place is unknown."""
-
     def points(self) -> PointCloud:
         """Return the sparse points."""
 
     def cloud(self) -> PointCloud:
         """Return the dense cloud."""
+
+    def cloud_on_map(self) -> tuple[PointCloud, str]:
+        """Return the dense cloud, z up in a system, and its WKT; as in `cloud` and empty where the place is unknown."""
 
     def perspective(self, *, centered: bool = False) -> PerspectiveScene:
         """Return the undistorted photos; `centered` turns them so that the optical center is in the middle."""

@@ -94,35 +94,22 @@ def write_las(scene: FinishedScene, target: Path, *, compressed: bool = False) -
     """
     import laspy
 
-    cloud = scene.cloud()
-    points = cloud.points
+    cloud, wkt = scene.cloud_on_map()
     head = laspy.LasHeader(point_format=2, version="1.2")  # the first version with colors: every reader knows it
-    if scene.map:
-        points = scene.map.positions(points)
-        if scene.map.crs:
-            head = laspy.LasHeader(point_format=7, version="1.4")  # the first version with systems of any kind
-            head.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(_well_known_text(scene.map.crs)))
-            head.global_encoding.wkt = True
+    if wkt:
+        head = laspy.LasHeader(point_format=7, version="1.4")  # the first version with systems of any kind
+        head.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+        head.global_encoding.wkt = True
     head.creation_date = None  # same cloud, same bytes
     head.generating_software = "sfm_app"
-    extent = float(np.ptp(points, axis=0).max()) or 1.0
+    extent = float(np.ptp(cloud.points, axis=0).max()) or 1.0
     step = float(10.0 ** np.ceil(np.log10(extent / 2e9)))  # 32 bits hold the longest side
-    head.offsets, head.scales = points.min(axis=0), np.full(3, step)
+    head.offsets, head.scales = cloud.points.min(axis=0), np.full(3, step)
     las = laspy.LasData(head)
-    las.x, las.y, las.z = points.T
+    las.x, las.y, las.z = cloud.points.T
     las.red, las.green, las.blue = cloud.colors.T.astype(np.uint16) * 257  # LAS has 16-bit colors
     with target.open("wb") as file:
         las.write(file, do_compress=compressed, laz_backend=laspy.LazBackend.Lazrs)
-
-
-def _well_known_text(crs: Any) -> str:
-    """Return a system of pyproj in the version of the LAS standard, or in a newer one that can express it."""
-    from pyproj.exceptions import CRSError
-
-    try:
-        return str(crs.to_wkt("WKT1_GDAL"))
-    except CRSError:
-        return str(crs.to_wkt())
 
 
 # Wavefront OBJ, with materials (MTL) and texture pages (JPEG) in separate files.

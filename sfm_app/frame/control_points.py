@@ -180,13 +180,7 @@ class ControlFit:
     """A model placed on ground control points."""
 
     from_model: Similarity
-    """To x east, y up and z south of the offset, in meters; x and z may follow a grid."""
-    crs: str
-    """Name of the grid, or place of the frame's origin."""
-    offset: tuple[float, float, float]
-    """(0, 0, 0) in units of the grid."""
-    units_per_m: tuple[float, float]
-    """Units of the grid per meter: horizontal, vertical."""
+    """To x east, y up and z south of the place, in meters; x and z may follow a grid."""
     deviation: float
     """Relative standard deviation of the scale."""
     rms_m: float
@@ -212,17 +206,7 @@ def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]
     marks = fit.scale * _mark_deviation([located[name] for name in inliers])
     deviation = max(_sigma(distances[used]), marks, MIN_SIGMA_M) / float(np.sqrt(used.sum())) / placed.spread(used)
     x, y, z = frame.origin.tolist()
-    return ControlFit(
-        fit,
-        frame.describe(),
-        (x, y, z) if frame.has_grid else (0.0, 0.0, 0.0),
-        frame.units_per_m if frame.has_grid else (1.0, 1.0),
-        deviation,
-        placed.miss(used),
-        inliers,
-        outliers,
-        MapPlace(given.crs, (x, y, z)),
-    )
+    return ControlFit(fit, deviation, placed.miss(used), inliers, outliers, MapPlace(given.crs, (x, y, z)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

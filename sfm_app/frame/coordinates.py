@@ -122,8 +122,6 @@ class LocalFrame:
         self.system, self.origin, self.center = system, origin, system.geocentric_m(origin[None])[0]
         if not np.isfinite(self.center).all():
             raise NumericalError("the coordinates are not on Earth")
-        self.has_grid, self.units_per_m = system.is_flat, (1.0 / system.unit, 1.0 / system.z_m)
-        """Whether x and y follow a grid, and its units per meter along them and along z."""
         self._turn = np.eye(3)
         if not system.is_flat:
             X, Y, Z = self.center.tolist()
@@ -156,21 +154,12 @@ class LocalFrame:
         x, y, z = (points @ self._turn).T
         return np.column_stack(self._topocentric.transform(x, y, z, direction="INVERSE"))
 
-    def describe(self) -> str:
-        """Return the grid, or the place of the origin, for people."""
-        if self.has_grid:
-            return self.system.name
-        longitude, latitude, height = self.system.geodetic(self.center[None])[0]
-        place = f"{np.degrees(latitude):.8f}, {np.degrees(longitude):.8f}, {height:.3f}"
-        return f"meters east, north and up of {place} ({self.system.name})"
-
     def _follow_grid(self) -> None:
         """Turn x to the grid if that is conformal here to a percent, as Web Mercator is."""
         step = 10.0  # in the grid's units: the Earth is flat over it to 1e-6
         (xx, xy, _), (yx, yy, _) = self(self.origin + step * np.eye(3)[:2]) / step
         along = complex(xx + yy, xy - yx) / 2.0
         if abs(complex(xx, xy) - along) < 0.01 * abs(along):
-            self.has_grid, self.units_per_m = True, (1.0 / abs(along), self.units_per_m[1])
             c = along.conjugate() / abs(along)
             self._turn = np.array([[c.real, -c.imag, 0.0], [c.imag, c.real, 0.0], [0.0, 0.0, 1.0]])
 
@@ -184,8 +173,8 @@ class MapFrame:
         self._turn = np.array([[cosine, -sine, 0.0], [0.0, 0.0, 1.0], [-sine, -cosine, 0.0]])
         known = self._local.system
         self._system = known if known.crs.is_projected or known.is_flat else _utm(known, self._local.center)
-        self.crs = None if known.is_flat else self._system.given
-        """That of pyproj; None for axes of the user's own."""
+        self.wkt = "" if known.is_flat else _well_known_text(self._system.given)
+        """Its system; empty for axes of the user's own."""
 
     def positions(self, points: FloatArray) -> FloatArray:
         """Return points (N, 3) of the frame on the map: x east, y north, z up, in units of the system."""
@@ -199,7 +188,18 @@ class MapFrame:
         offset = self.positions(np.zeros((1, 3)))[0]
         linear = (self.positions(np.eye(3)) - self.positions(-np.eye(3))).T / 2.0
         matrix = np.vstack([np.column_stack([linear, offset]), [0.0, 0.0, 0.0, 1.0]])
-        return {"system": self._system.name, "offset": offset.tolist(), "transform": matrix.tolist()}
+        system = {"system": self._system.name, "wkt": self.wkt}
+        return system | {"offset": offset.tolist(), "transform": matrix.tolist()}
+
+
+def _well_known_text(crs: Any) -> str:
+    """Return a system of pyproj in the version of the LAS standard, or in a newer one that can express it."""
+    from pyproj.exceptions import CRSError
+
+    try:
+        return str(crs.to_wkt("WKT1_GDAL"))
+    except CRSError:
+        return str(crs.to_wkt())
 
 
 def _utm(system: CoordinateSystem, center: FloatArray) -> CoordinateSystem:
@@ -209,7 +209,7 @@ def _utm(system: CoordinateSystem, center: FloatArray) -> CoordinateSystem:
 
     longitude, latitude, _ = np.degrees(system.geodetic(center[None])[0])
     zone, side = int((longitude + 180.0) // 6.0) % 60 + 1, "N" if latitude >= 0.0 else "S"
-    if system.crs.geodetic_crs.name == "WGS 84":
+    if system.crs.datum.name.startswith("World Geodetic System 1984"):
         return read_system(f"EPSG:{(32600 if side == 'N' else 32700) + zone}")
     base = GeographicCRS(name=system.crs.geodetic_crs.name, datum=system.crs.datum)
     name = f"{base.name} / UTM zone {zone}{side}"

@@ -148,7 +148,9 @@ MOST_XMP_BYTES = 262_144
 def xmp_entries(image: Image.Image, exif: Image.Exif | None = None) -> dict[str, str]:
     """Return the texts of a decoded picture's XMP, or that of its EXIF, by prefix and name; empty without."""
     keys = ("xmp", "XML:com.adobe.xmp")  # older versions of Pillow call that of PNG so
-    xmp = next((image.info[key] for key in keys if image.info.get(key)), None) or (exif.get(Base.XMLPacket) if exif else None)
+    xmp = next((image.info[key] for key in keys if image.info.get(key)), None) or (
+        exif.get(Base.XMLPacket) if exif else None
+    )
     data = xmp.encode() if isinstance(xmp, str) else xmp if isinstance(xmp, bytes) else b""
     entries = ((a or c, b or d) for a, b, c, d in XMP_ENTRY.findall(data[:MOST_XMP_BYTES]))
     return {name.decode(): value.decode(errors="replace").strip() for name, value in entries}

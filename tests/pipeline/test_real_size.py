@@ -155,11 +155,10 @@ def test_control_points_give_size_and_place(measured, tmp_path):
     run = again(measured, control_points=str(marks_file(measured, tmp_path / "gcp_list.txt", GROUND[:5])))
     found = read_scale(measured.out)
     assert_scale(found, true_similarity(measured).scale, within=0.007)
-    assert found["crs"] == "EPSG:32632"
+    assert found["map"]["system"] == "EPSG:32632"
     frame = Similarity(found["scale"], np.array(found["R"]), np.array(found["t"]))
     for name, pose in run.scene.cam_from_world.items():
-        x, y, z = frame(camera_center(pose))
-        east_north_up = np.array([x, -z, y]) * [*2 * found["units_per_m"][:1], 1.0] + found["offset"]
+        east_north_up = (np.array(found["map"]["transform"]) @ [*frame(camera_center(pose)), 1.0])[:3]
         assert np.linalg.norm(east_north_up - to_utm(camera_center(measured.truth.cam_from_world[name]))) < 0.03
 
 
@@ -184,7 +183,7 @@ def test_control_points_in_feet_give_the_same_size(measured, tmp_path):
     path.write_text("\n".join(["EPSG:2263", *marks]), encoding="utf-16")  # as PowerShell writes
     run = again(measured, control_points=str(path))
     assert_scale(read_scale(measured.out), true_similarity(measured).scale, within=0.007)
-    assert read_scale(measured.out)["crs"] == "EPSG:2263"
+    assert read_scale(measured.out)["map"]["system"] == "EPSG:2263"
     assert run.manifest["stages"]["scale"]["counts"]["problems"] == []
 
 

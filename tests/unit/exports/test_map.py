@@ -6,8 +6,11 @@ import laspy
 import numpy as np
 import pyproj
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import sfm_app
+from sfm_app.frame.coordinates import MapFrame
 from sfm_app.frame.scale import MetricFrame
 from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import json_text
@@ -93,6 +96,26 @@ def test_gps_puts_the_cloud_into_the_zone_of_utm(placed, lon, lat, heading_deg, 
     found = on_earth(points, (lon, lat, HEIGHT), WGS84, -heading_deg)
     record = check(out, points, utm(*found, south=lat < 0, zone=code % 100), code)
     assert record["system"] == f"EPSG:{code}"
+
+
+@settings(max_examples=60)
+@given(
+    st.floats(-179.9, 179.9), st.floats(-79.0, 79.0), st.floats(-100.0, 5000.0), st.floats(0.0, 360.0),
+    st.lists(st.tuples(*[st.floats(-300.0, 300.0)] * 3), min_size=1, max_size=4),
+)  # fmt: skip
+def test_any_place_agrees_with_formulas(lon, lat, height, heading_deg, points):
+    place = MapPlace("EPSG:4979", (lon, lat, height), heading_deg)
+    points = np.array(points)
+    found = on_earth(points, place.origin, WGS84, -heading_deg)
+    zone = int((lon + 180.0) // 6.0) + 1
+    expected = utm(*found, south=lat < 0.0, zone=zone)
+    here = MapFrame(place)
+    assert np.abs(here.positions(points) - expected).max() < 0.001
+    known = here.to_dict()
+    linear = np.column_stack([points, np.ones(len(points))]) @ np.array(known["transform"]).T
+    reach = np.linalg.norm(points, axis=1).max()
+    assert np.abs(linear[:, :3] - expected).max() < 0.001 + reach**2 / 2e6
+    assert pyproj.CRS(known["wkt"]).utm_zone == f"{zone}{'S' if lat < 0 else 'N'}"
 
 
 def test_geographic_control_points_keep_their_datum(placed):
