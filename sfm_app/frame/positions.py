@@ -9,7 +9,15 @@ import numpy as np
 
 from sfm_app.errors import InputError
 from sfm_app.files import read_text
-from sfm_app.frame.control_points import MISTAKES, MOST_BYTES, check_position, find_photo, index_files, read_header
+from sfm_app.frame.control_points import (
+    MISTAKES,
+    MOST_BYTES,
+    MOST_WORDS,
+    check_position,
+    find_photo,
+    index_files,
+    read_header,
+)
 from sfm_app.frame.coordinates import GPS_SYSTEM, CoordinateSystem, read_system
 from sfm_app.types import GpsPosition
 from sfm_app.types.photos import FILE
@@ -19,6 +27,7 @@ FORM = (
     "the first line is a coordinate system such as EPSG:4326; each other one: photo x y [z [omega phi kappa "
     "[horizontal and vertical deviation in meters]]], with east or longitude first"
 )
+DIVIDERS = re.compile(r'[\t;,"]+')
 COUNTS = (2, 3, 6, 8)
 """How many numbers may follow the name of a photo."""
 TITLES = re.compile(
@@ -66,20 +75,13 @@ def read_positions(path: Path, files: Collection[str]) -> tuple[dict[str, GpsPos
 
 def _read_line(line: str, index: Sequence[dict[str, list[str]]], *, is_table: bool) -> tuple[str, list[float], bool]:
     """Return the photo of a line, its numbers, and whether the photo is a file of the folder."""
-    divider = next((sign for sign in "\t;," if line.count(sign) >= 2), None)
-    if divider:
-        name, *words = (word.strip().strip('"') for word in line.split(divider))
-        words = words[:3] if is_table else words
-        tails = [(name, " ".join(words))]
-    else:
-        words = line.split()
-        parts = [line.rsplit(None, count) for count in range(2, min(len(words), max(COUNTS) + 1))]
-        tails = [(part[0], " ".join(part[1:])) for part in parts]
-    if not tails:
+    words = DIVIDERS.sub(" ", line).split()
+    if len(words) < 3:
         raise ValueError("is malformed")
+    tails = [(" ".join(words[:-count]), " ".join(words[-count:])) for count in range(2, min(len(words), MOST_WORDS))]
     photo, text, is_there = find_photo(tails, index)
     try:
-        values = [float(word) for word in text.split()]
+        values = [float(word) for word in text.split()[: 3 if is_table else None]]
     except ValueError:
         raise ValueError("is malformed") from None
     if len(values) not in COUNTS:
