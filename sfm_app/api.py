@@ -299,7 +299,7 @@ def export_model(
         >>> [path.name for path in files[:2]]
         ['model.obj', 'model.mtl']
     """
-    from sfm_app.exports import check_parts, stored_model  # loads COLMAP
+    from sfm_app.exports import check_parts, record_map, stored_model  # loads COLMAP
 
     plugins = load_plugins()
     place = Path(target) if target is not None else Path(out)
@@ -314,7 +314,9 @@ def export_model(
     renamed = dict(zip([place.name, *list(files)[1:]], files.values(), strict=True))
     with _naming_target(place):
         check_parts(place, list(renamed)[1:])
-        return save_files(renamed, place.parent)
+        saved = save_files(renamed, place.parent)
+        record_map(run, place.parent)
+        return saved
 
 
 def export_scene(
@@ -338,7 +340,7 @@ def export_scene(
         >>> sorted(path.name for path in folder.iterdir())
         ['export.json', 'images', 'sparse']
     """
-    from sfm_app.exports import StoredScene, check_cloud, fill_folder  # loads COLMAP
+    from sfm_app.exports import StoredScene, check_cloud, fill_folder, record_map  # loads COLMAP
 
     exporter = load_plugins().scene_exporter(file_format)
     place = Path(target) if target is not None else Path(out)
@@ -354,6 +356,7 @@ def export_scene(
         file = _with_suffix(place / exporter.file if place.is_dir() else place, exporter.suffix)
         with _naming_target(file), replace_atomically(file) as path:
             exporter.write(scene, path)
+            record_map(run, file.parent)
         return file
 
 

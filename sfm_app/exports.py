@@ -29,9 +29,10 @@ from sfm_app.colmap.surface import FUSED, open_points, positions
 from sfm_app.colmap.wide_views import ViewNames, WideLens, render_views, save_picture
 from sfm_app.engine.stage import Products, Stage, check_undamaged, resume_hint
 from sfm_app.errors import InputError
-from sfm_app.files import RECORD, recorded_files, replace_atomically, replace_folder
+from sfm_app.files import RECORD, read_object, recorded_files, replace_atomically, replace_folder, save_files
 from sfm_app.formats.scenes import plain_names
-from sfm_app.frame.scale import GPS, MetricFrame, move_model
+from sfm_app.frame.coordinates import MapFrame
+from sfm_app.frame.scale import GPS, MetricFrame, map_entry, move_model
 from sfm_app.frame.sighted_points import Distance, PosedPhotos, measure_distance
 from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import json_text
@@ -53,8 +54,18 @@ def stored_frame(run: RunContext) -> MetricFrame:
     if run.workspace.manifest.record(SCALE.name) is not None:
         return Products(run)[SCALE]
     known = run.workspace.manifest.record(SCENE.name) is not None
-    deviation = Products(run)[SCENE].gps_deviation if known else None
-    return MetricFrame() if deviation is None else MetricFrame(deviation=deviation, source=GPS)
+    scene = Products(run)[SCENE] if known else None
+    if scene is None or scene.gps_deviation is None:
+        return MetricFrame()
+    return MetricFrame(deviation=scene.gps_deviation, source=GPS, place=scene.gps_place)
+
+
+def record_map(run: RunContext, folder: Path) -> None:
+    """Write the place of exported files on the map into the record beside them, and remove that of an earlier run."""
+    known = read_object(folder / RECORD)
+    record = {key: value for key, value in known.items() if key != "map"} | map_entry(stored_frame(run).place)
+    if record != known:
+        save_files({RECORD: json_text(record).encode()}, folder)
 
 
 def export_frame(run: RunContext) -> Similarity | None:
@@ -149,6 +160,7 @@ class StoredScene:
     def __init__(self, run: RunContext) -> None:
         self._run = run
         self.scene, self._model = stored_scene(run)
+        self._place = stored_frame(run).place
         self.images = dict[str, str]()
         """Photo by name of its file, of all photos written so far."""
 
@@ -159,6 +171,14 @@ class StoredScene:
     def cloud(self) -> PointCloud:
         """Return the dense cloud."""
         return stored_cloud(self._run)
+
+    def cloud_on_map(self) -> tuple[PointCloud, str]:
+        """Return the dense cloud, z up in a system, and its WKT; as in `cloud` and empty where the place is unknown."""
+        cloud = self.cloud()
+        if self._place is None:
+            return cloud, ""
+        here = MapFrame(self._place)
+        return PointCloud(here.positions(cloud.points), cloud.colors), here.wkt
 
     def perspective(self, *, centered: bool = False) -> "StoredPhotos":
         """Return the undistorted photos; `centered` puts the optical center in the middle."""
@@ -175,6 +195,7 @@ class StoredScene:
             "format": file_format,
             "photo_of": {image: paths.get(photo, photo) for image, photo in self.images.items()},
             "unregistered": {paths.get(photo, photo): why for photo, why in self.scene.unregistered.items()},
+            **map_entry(self._place),
         }
 
     def say(self, text: str) -> None:

@@ -11,12 +11,14 @@ from sfm_app.colmap.dense import digest_maps
 from sfm_app.engine.execution import Pipeline
 from sfm_app.engine.stage import Products, Stage
 from sfm_app.frame.control_points import read_control_points
+from sfm_app.frame.positions import GEO_TXT, read_positions
 from sfm_app.frame.scale import MetricFrame
 from sfm_app.photos.source import read_source
 from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.stages import depth_maps, files, intrinsics, match_graph, mesh, photos, scale, scene, texture, view_graph
 from sfm_app.types import Intrinsics, MatchGraph, Model, PhotoSet, Scene, Surface, ViewGraph
+from sfm_app.wording import list_names
 
 PHOTOS: Stage[PhotoSet] = Stage(
     name="photos",
@@ -129,7 +131,14 @@ def run_stages(
     if run.settings.calibration.file:
         run = replace(run, given=read_given_cameras(Path(run.settings.calibration.file)))
     source = read_source(photo_dir, place.root, options, partial(ordered_map, run.executor, ahead=4 * run.workers))
+    files = [name for name in source.files if name]
+    given = Path(options.positions) if options.positions else photo_dir / GEO_TXT
+    if options.positions or given.is_file():
+        positions, missing = read_positions(given, files)
+        if missing:
+            run.progress.say(f"{given} names photos that the folder does not have: {list_names(missing, 5)}")
+        others = [name for name in source.files if (photo_dir / name).resolve() != given.resolve()]
+        source = replace(source, files={name: source.files[name] for name in others}, positions=positions)
     if run.settings.scale.control_points:
-        files = [name for name in source.files if name]
         run = replace(run, control_points=read_control_points(Path(run.settings.scale.control_points), files))
     return PIPELINE.run(source, run, first, last, targets)

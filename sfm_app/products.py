@@ -18,7 +18,7 @@ from sfm_app.colmap.backend import Reconstruction, check_written, translate_erro
 from sfm_app.colmap.database import digest_matches, is_sound, read_match_graph
 from sfm_app.colmap.model import read_scene as read_colmap_scene
 from sfm_app.files import digest_files, is_below, load_arrays, replace_atomically, replace_folder
-from sfm_app.frame.scale import MetricFrame
+from sfm_app.frame.scale import MetricFrame, read_place
 from sfm_app.numerical import json_text
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import (
@@ -147,6 +147,7 @@ def write_scene(scene: Scene, place: Workspace) -> None:
         "camera_of": dict(scene.camera_of),
         "unregistered": dict(scene.unregistered),
         "gps_deviation": scene.gps_deviation,
+        "gps_place": scene.gps_place and asdict(scene.gps_place),
     }
     _write_json(place.scene, values)
 
@@ -156,7 +157,7 @@ def read_scene(place: Workspace) -> Scene:
     values = _read_json(place.scene)
     with translate_errors("reading the sparse model"):
         scene = read_colmap_scene(place.sparse, values["camera_of"], values["unregistered"], values["cameras"])
-    return replace(scene, gps_deviation=values.get("gps_deviation"))
+    return replace(scene, gps_deviation=values.get("gps_deviation"), gps_place=read_place(values.get("gps_place")))
 
 
 hash_scene = hash_files("sparse", "scene.json")

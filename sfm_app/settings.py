@@ -47,6 +47,9 @@ class PhotoSettings(Section):
     masks: str = Field(
         "", description="folder of masks, such as sub/a.jpg.png, or one mask of all photos; black areas are left out"
     )
+    positions: str = Field(
+        "", description="file with positions of photos, as OpenDroneMap's geo.txt; where empty, geo.txt beside them"
+    )
     cameras: Literal["auto", "single", "folder", "each"] = Field(
         "auto",
         description="auto: same size and same EXIF camera share one; single: all share one; folder: those of a folder; "

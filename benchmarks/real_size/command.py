@@ -127,14 +127,12 @@ def row_of(by: str, scene: str, seed: int, place: Path, views: Views, truth: Sim
         "deviation %": 100 * found["deviation"],
         "in deviations": error / found["deviation"],
     }
-    if found["crs"]:
+    if "map" in found:
         frame = Similarity(found["scale"], np.array(found["R"]), np.array(found["t"]))
         off = []
         for name, center in found_centers(place).items():
-            x, y, z = frame(center)
-            horizontal, vertical = found["units_per_m"]
-            mapped = np.array([horizontal * x, -horizontal * z, vertical * y]) + found["offset"]
-            east, north, up = GROUND(mapped[None])[0]
+            mapped = np.array(found["map"]["transform"]) @ [*frame(center), 1.0]
+            east, north, up = GROUND(mapped[None, :3])[0]
             off.append(np.linalg.norm(np.array([east, up, -north]) - camera_center(views.cam_from_world[name])))
         row["center"] = 1000 * float(np.median(off)) / distance
         row["named"] = len(counts["control_points"]["wrong"])

@@ -64,6 +64,7 @@ SETTING_FLAGS = (
     SettingFlag("--quality", "quality"),
     SettingFlag("--images", "photos.images", metavar="FILE"),
     SettingFlag("--masks", "photos.masks", metavar="FOLDER"),
+    SettingFlag("--positions", "photos.positions", metavar="FILE"),
     SettingFlag("--cameras", "photos.cameras"),
     SettingFlag("--max-frames", "photos.max_frames"),
     SettingFlag("--keep-low-quality", "photos.keep_low_quality"),

@@ -74,6 +74,9 @@ class FinishedScene(Protocol):
     def cloud(self) -> PointCloud:
         """Return the dense cloud."""
 
+    def cloud_on_map(self) -> tuple[PointCloud, str]:
+        """Return the dense cloud, z up in a system, and its WKT; as in `cloud` and empty where the place is unknown."""
+
     def perspective(self, *, centered: bool = False) -> PerspectiveScene:
         """Return the undistorted photos; `centered` turns them so that the optical center is in the middle."""
 

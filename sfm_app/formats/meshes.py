@@ -88,11 +88,18 @@ def cloud_ply(cloud: PointCloud) -> bytes:
 
 
 def write_las(scene: FinishedScene, target: Path, *, compressed: bool = False) -> None:
-    """Write the dense cloud as LAS or LAZ with colors, exact to a hundred-millionth of its size; needs laspy."""
+    """Write the dense cloud as LAS or LAZ with colors, exact to a hundred-millionth of its size; needs laspy.
+
+    It lies on the map, z up, where its place is known.
+    """
     import laspy
 
-    cloud = scene.cloud()
+    cloud, wkt = scene.cloud_on_map()
     head = laspy.LasHeader(point_format=2, version="1.2")  # the first version with colors: every reader knows it
+    if wkt:
+        head = laspy.LasHeader(point_format=7, version="1.4")  # the first version with systems of any kind
+        head.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+        head.global_encoding.wkt = True
     head.creation_date = None  # same cloud, same bytes
     head.generating_software = "sfm_app"
     extent = float(np.ptp(cloud.points, axis=0).max()) or 1.0

@@ -19,7 +19,7 @@ from sfm_app.frame.coordinates import GPS_SYSTEM, CoordinateSystem, LocalFrame, 
 from sfm_app.frame.sighted_points import SightedPoint
 from sfm_app.geometry.poses import Similarity, robust_similarity, umeyama
 from sfm_app.numerical import FAILURES
-from sfm_app.types import ControlPoint, ControlPoints, GpsPosition
+from sfm_app.types import ControlPoint, ControlPoints, GpsPosition, MapPlace
 from sfm_app.types.arrays import FloatArray
 from sfm_app.wording import format_length
 
@@ -48,7 +48,7 @@ def read_control_points(path: Path, files: Collection[str] = ()) -> ControlPoint
     try:
         lines = [(number, line.strip()) for number, line in enumerate(read_text(path, MOST_BYTES).splitlines(), 1)]
         lines = [line for line in lines if line[1] and not line[1].startswith("#")]
-        system, header = _read_header(lines)
+        system, header = read_header(lines)
         points = _read_marks(lines, system, files)
         if not points:
             raise ValueError("it holds no point")
@@ -61,8 +61,8 @@ def read_control_points(path: Path, files: Collection[str] = ()) -> ControlPoint
     return ControlPoints(points, header, str(path), fingerprint(header, content))
 
 
-def _read_header(lines: list[tuple[int, str]]) -> tuple[CoordinateSystem, str]:
-    """Take the coordinate system from the lines; WKT may have several."""
+def read_header(lines: list[tuple[int, str]]) -> tuple[CoordinateSystem, str]:
+    """Take the coordinate system from numbered lines; WKT may have several. ValueError if PROJ does not know it."""
     if not lines:
         raise ValueError("it names no coordinate system")
     number, header = lines.pop(0)
@@ -82,19 +82,19 @@ Position = tuple[float, float, float]
 def _read_marks(
     lines: Sequence[tuple[int, str]], system: CoordinateSystem, files: Collection[str]
 ) -> tuple[ControlPoint, ...]:
-    index, missing = _index_files(files), list[str]()
+    index, missing = index_files(files), list[str]()
     names: dict[Position, str] = {}
     positions: dict[str, Position] = {}
     marks: dict[str, dict[str, tuple[float, float]]] = {}
     for number, line in lines:
         try:
             position, mark, tails = _read_mark(line)
-            photo, name, is_there = _find_photo(tails, index)
+            photo, name, is_there = find_photo(tails, index)
         except ValueError as err:
             raise ValueError(f"line {number} {err}") from None
         name = name or names.setdefault(position, f"point {len(names) + 1}")
         if name not in positions:
-            _check_position(position, system, number)
+            check_position(position, system, number)
         if positions.setdefault(name, position) != position:
             raise ValueError(f"line {number} gives '{name}' another position than an earlier line")
         marks.setdefault(name, {})[photo] = mark
@@ -123,7 +123,8 @@ def _read_mark(line: str) -> tuple[Position, tuple[float, float], list[tuple[str
     return (x, y, z), (column, row), tails[::-1]
 
 
-def _check_position(position: Position, system: CoordinateSystem, line: int) -> None:
+def check_position(position: Position, system: CoordinateSystem, line: int) -> None:
+    """Raise a ValueError if a system has no such position; it says whether swapped columns would be one."""
     x, y, z = position
     there, swapped = np.isfinite(system.geocentric_m(np.array([[x, y, z], [y, x, z]]))[:, 0])
     if not there:
@@ -131,8 +132,8 @@ def _check_position(position: Position, system: CoordinateSystem, line: int) -> 
         raise ValueError(f"line {line} has a position out of range of the system {system.name}{advice}")
 
 
-def _index_files(files: Collection[str]) -> tuple[dict[str, list[str]], ...]:
-    """Return files by what marks may call them: path, name, name in other case, the same without suffix."""
+def index_files(files: Collection[str]) -> tuple[dict[str, list[str]], ...]:
+    """Return files by what users may call them: path, name, name in other case, the same without suffix."""
     index: tuple[dict[str, list[str]], ...] = ({}, {}, {}, {})
     for file in files:
         path = PurePosixPath(file)
@@ -143,9 +144,7 @@ def _index_files(files: Collection[str]) -> tuple[dict[str, list[str]], ...]:
     return index
 
 
-def _find_photo(
-    tails: Sequence[tuple[str, str]], index: Sequence[Mapping[str, Sequence[str]]]
-) -> tuple[str, str, bool]:
+def find_photo(tails: Sequence[tuple[str, str]], index: Sequence[Mapping[str, Sequence[str]]]) -> tuple[str, str, bool]:
     """Return the photo of a mark, the name of its point, and whether the photo is a file of the folder.
 
     `tails` are pairs of both, the longest photo first. A ValueError says that several photos fit equally well.
@@ -181,19 +180,14 @@ class ControlFit:
     """A model placed on ground control points."""
 
     from_model: Similarity
-    """To x east, y up and z south of the offset, in meters; x and z may follow a grid."""
-    crs: str
-    """Name of the grid, or place of the frame's origin."""
-    offset: tuple[float, float, float]
-    """(0, 0, 0) in units of the grid."""
-    units_per_m: tuple[float, float]
-    """Units of the grid per meter: horizontal, vertical."""
+    """To x east, y up and z south of the place, in meters; x and z may follow a grid."""
     deviation: float
     """Relative standard deviation of the scale."""
     rms_m: float
     inliers: tuple[str, ...]
     outliers: Mapping[str, float]
     """Distance of each rejected point from the fit, in meters."""
+    place: MapPlace
 
 
 def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]) -> ControlFit | str:
@@ -211,9 +205,8 @@ def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]
     outliers = {name: float(miss) for name, inlier, miss in zip(names, used, distances, strict=True) if not inlier}
     marks = fit.scale * _mark_deviation([located[name] for name in inliers])
     deviation = max(_sigma(distances[used]), marks, MIN_SIGMA_M) / float(np.sqrt(used.sum())) / placed.spread(used)
-    east, north, up = frame.origin.tolist() if frame.has_grid else (0.0, 0.0, 0.0)
-    units = frame.units_per_m if frame.has_grid else (1.0, 1.0)
-    return ControlFit(fit, frame.describe(), (east, north, up), units, deviation, placed.miss(used), inliers, outliers)
+    x, y, z = frame.origin.tolist()
+    return ControlFit(fit, deviation, placed.miss(used), inliers, outliers, MapPlace(given.crs, (x, y, z)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from sfm_app.errors import NumericalError
+from sfm_app.types import MapPlace
 from sfm_app.types.arrays import FloatArray
 
 GPS_SYSTEM = "EPSG:4979"
@@ -31,6 +32,8 @@ class CoordinateSystem:
         """`text` is the name for people, `crs` that of pyproj."""
         from pyproj import Transformer
 
+        self.given = crs
+        crs = _unbound(crs)
         parts = [_unbound(part) for part in crs.sub_crs_list] if crs.is_compound else [crs]
         self.crs, axes = parts[0], parts[0].axis_info
         self.is_flat: bool = self.crs.is_engineering
@@ -84,6 +87,16 @@ class CoordinateSystem:
         x, y, z = points.T
         return np.column_stack(self._cart.transform(x, y, z, radians=True, direction="INVERSE"))
 
+    def to_wgs84(self, positions: FloatArray) -> FloatArray:
+        """Return longitude, latitude in degrees and height (N, 3); heights change their unit only."""
+        from pyproj import Transformer
+
+        if self.crs.is_geocentric:
+            return np.asarray(self.geodetic(self.geocentric_m(positions)) * [*2 * [180.0 / np.pi], 1.0])
+        flat = self.crs if self.given.is_compound else self.given.to_2d()
+        change = Transformer.from_crs(flat, "EPSG:4326", always_xy=True)
+        return np.column_stack([*change.transform(*positions[:, :2].T), positions[:, 2] * self.z_m])
+
     def degrees_outside(self, point: FloatArray) -> float:
         """Return how far a geocentric point (3,) lies outside of the area for which the system is made; 0 inside."""
         area = self.crs.area_of_use
@@ -109,8 +122,6 @@ class LocalFrame:
         self.system, self.origin, self.center = system, origin, system.geocentric_m(origin[None])[0]
         if not np.isfinite(self.center).all():
             raise NumericalError("the coordinates are not on Earth")
-        self.has_grid, self.units_per_m = system.is_flat, (1.0 / system.unit, 1.0 / system.z_m)
-        """Whether x and y follow a grid, and its units per meter along them and along z."""
         self._turn = np.eye(3)
         if not system.is_flat:
             X, Y, Z = self.center.tolist()
@@ -134,18 +145,14 @@ class LocalFrame:
 
     def positions(self, points: FloatArray) -> FloatArray:
         """Return points (N, 3) of the frame as positions in the system."""
-        if self.system.is_flat:
-            return self.system.positions(points + self.center)
-        x, y, z = (points @ self._turn).T
-        return self.system.positions(np.column_stack(self._topocentric.transform(x, y, z, direction="INVERSE")))
+        return self.system.positions(self.geocentric_m(points))
 
-    def describe(self) -> str:
-        """Return the grid, or the place of the origin, for people."""
-        if self.has_grid:
-            return self.system.name
-        longitude, latitude, height = self.system.geodetic(self.center[None])[0]
-        place = f"{np.degrees(latitude):.8f}, {np.degrees(longitude):.8f}, {height:.3f}"
-        return f"meters east, north and up of {place} ({self.system.name})"
+    def geocentric_m(self, points: FloatArray) -> FloatArray:
+        """Return points (N, 3) of the frame as those of the system's `geocentric_m`."""
+        if self.system.is_flat:
+            return np.asarray(points + self.center)
+        x, y, z = (points @ self._turn).T
+        return np.column_stack(self._topocentric.transform(x, y, z, direction="INVERSE"))
 
     def _follow_grid(self) -> None:
         """Turn x to the grid if that is conformal here to a percent, as Web Mercator is."""
@@ -153,9 +160,61 @@ class LocalFrame:
         (xx, xy, _), (yx, yy, _) = self(self.origin + step * np.eye(3)[:2]) / step
         along = complex(xx + yy, xy - yx) / 2.0
         if abs(complex(xx, xy) - along) < 0.01 * abs(along):
-            self.has_grid, self.units_per_m = True, (1.0 / abs(along), self.units_per_m[1])
             c = along.conjugate() / abs(along)
             self._turn = np.array([[c.real, -c.imag, 0.0], [c.imag, c.real, 0.0], [0.0, 0.0, 1.0]])
+
+
+class MapFrame:
+    """A frame in meters with y up on a map: the projected system of its place, else the zone of UTM on its datum."""
+
+    def __init__(self, place: MapPlace) -> None:
+        self._local = LocalFrame(read_system(place.system), np.array(place.origin))
+        cosine, sine = np.cos(np.radians(place.heading_deg)), np.sin(np.radians(place.heading_deg))
+        self._turn = np.array([[cosine, -sine, 0.0], [0.0, 0.0, 1.0], [-sine, -cosine, 0.0]])
+        known = self._local.system
+        self._system = known if known.crs.is_projected or known.is_flat else _utm(known, self._local.center)
+        self.wkt = "" if known.is_flat else _well_known_text(self._system.given)
+        """Its system; empty for axes of the user's own."""
+
+    def positions(self, points: FloatArray) -> FloatArray:
+        """Return points (N, 3) of the frame on the map: x east, y north, z up, in units of the system."""
+        return self._system.positions(self._local.geocentric_m(points @ self._turn))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the system, the offset, and the linear map of points near (0, 0, 0) as plain values.
+
+        The Earth bends away from it, by 1 mm at 110 m.
+        """
+        offset = self.positions(np.zeros((1, 3)))[0]
+        linear = (self.positions(np.eye(3)) - self.positions(-np.eye(3))).T / 2.0
+        matrix = np.vstack([np.column_stack([linear, offset]), [0.0, 0.0, 0.0, 1.0]])
+        system = {"system": self._system.name, "wkt": self.wkt}
+        return system | {"offset": offset.tolist(), "transform": matrix.tolist()}
+
+
+def _well_known_text(crs: Any) -> str:
+    """Return a system of pyproj in the version of the LAS standard, or in a newer one that can express it."""
+    from pyproj.exceptions import CRSError
+
+    try:
+        return str(crs.to_wkt("WKT1_GDAL"))
+    except CRSError:
+        return str(crs.to_wkt())
+
+
+def _utm(system: CoordinateSystem, center: FloatArray) -> CoordinateSystem:
+    """Return the zone of UTM of a geocentric point (3,), on the datum of a system, which avoids a shift."""
+    from pyproj.crs import GeographicCRS, ProjectedCRS
+    from pyproj.crs.coordinate_operation import UTMConversion
+
+    longitude, latitude, _ = np.degrees(system.geodetic(center[None])[0])
+    zone, side = int((longitude + 180.0) // 6.0) % 60 + 1, "N" if latitude >= 0.0 else "S"
+    if system.crs.datum.name.startswith("World Geodetic System 1984"):
+        return read_system(f"EPSG:{(32600 if side == 'N' else 32700) + zone}")
+    base = GeographicCRS(name=system.crs.geodetic_crs.name, datum=system.crs.datum)
+    name = f"{base.name} / UTM zone {zone}{side}"
+    crs = ProjectedCRS(UTMConversion(zone, hemisphere=side), name=name, geodetic_crs=base)
+    return CoordinateSystem(crs.to_wkt(), crs)
 
 
 @lru_cache(maxsize=64)
@@ -173,7 +232,7 @@ def read_system(text: str) -> CoordinateSystem:
         # PROJ also takes names that merely resemble its own
         if not re.search(r"[:=\[{]|^\d+$", code) and _letters(crs.name) != _letters(code):
             raise ValueError(f"{unknown}; the nearest name is '{crs.name}'")
-        return CoordinateSystem(text, _unbound(crs))
+        return CoordinateSystem(text, crs)
     except (pyproj.exceptions.ProjError, RecursionError):  # JSON may be nested
         raise ValueError(unknown) from None
 

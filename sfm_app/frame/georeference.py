@@ -11,6 +11,7 @@ from sfm_app.geometry.poses import Similarity, draw_pairs, perpendicular_basis, 
 from sfm_app.numerical import FAILURES, MAD_TO_SIGMA
 from sfm_app.types import GpsPosition, Rejected
 from sfm_app.types.arrays import FloatArray
+from sfm_app.types.photos import FILE
 
 MIN_POSITIONS = 3
 """Least number of distinct positions that must agree."""
@@ -24,6 +25,10 @@ class GpsOptions:
     """Largest residual that consumer GPS explains."""
     max_residual_share: float = 0.15
     """The same, as a share of the spread of the photos; the larger one counts."""
+    deviation_m: float = 5.0
+    """Standard deviation of positions without one: consumer GPS errs by 3 to 10 m."""
+    min_deviation_m: float = 0.02
+    """Least deviation that counts: antennas are a hand away from lenses. Chosen by hand."""
     significance: float = 1e-3
     """Largest probability that positions unrelated to the cameras fit as well."""
     max_scale_deviation: float = 0.1
@@ -75,14 +80,14 @@ def georeference(
     fit = _fit_positions(cameras, given, up, up_is_sure)
     if max(abs(one.longitude_deg) for one in given) > 90.0:
         return fit
-    swapped = [GpsPosition(one.longitude_deg, one.latitude_deg, one.altitude_m) for one in given]
+    swapped = [replace(one, latitude_deg=one.longitude_deg, longitude_deg=one.latitude_deg) for one in given]
     other = _fit_positions(cameras, swapped, up, up_is_sure)
     rms_m = fit.rms_m if isinstance(fit, Georeference) else np.inf
     if isinstance(other, Georeference) and OPTIONS.min_swap_gain * other.rms_m < min(rms_m, _width(swapped)):
         now = f"they miss by {rms_m:.2g} m" if fit else "they do not agree"
-        return Rejected(
-            f"latitude and longitude are probably swapped: {now}, and swapped by {other.rms_m:.2g} m; correct the EXIF"
-        )
+        place = "file of positions" if given[0].zero == FILE else "EXIF"
+        swap = "latitude and longitude are probably swapped"
+        return Rejected(f"{swap}: {now}, and swapped by {other.rms_m:.2g} m; correct the {place}")
     return fit
 
 
@@ -96,11 +101,11 @@ def _fit_positions(
 ) -> Georeference | Rejected:
     origin = _median_position(given)
     enu = enu_m(given, origin)
-    level = _fit_on_ground(cameras, enu, up, origin)
+    level = _fit_on_ground(cameras, enu, up, given)
     if up_is_sure and level:
         return level
     gps_up = _up_from_positions(cameras, enu, given)
-    tilted = _fit_on_ground(cameras, enu, gps_up[0], origin) if gps_up else level
+    tilted = _fit_on_ground(cameras, enu, gps_up[0], given) if gps_up else level
     return replace(tilted, up_deviation_deg=gps_up[1]) if gps_up and isinstance(tilted, Georeference) else level
 
 
@@ -136,7 +141,7 @@ def _median_position(positions: Sequence[GpsPosition]) -> GpsPosition:
 
 
 def _fit_on_ground(
-    cameras: FloatArray, enu: FloatArray, up: FloatArray, origin: GpsPosition
+    cameras: FloatArray, enu: FloatArray, up: FloatArray, given: Sequence[GpsPosition]
 ) -> Georeference | Rejected:
     axes = perpendicular_basis(up)
     # horizontal components as x + iy
@@ -144,17 +149,19 @@ def _fit_on_ground(
     spread = float(MAD_TO_SIGMA * np.median(np.abs(w - (np.median(w.real) + 1j * np.median(w.imag)))))
     limit = max(OPTIONS.max_residual_m, OPTIONS.max_residual_share * spread)
     agreeing = _inlier_mask(z, w, limit)
-    a, b = _fit_complex_line(z[agreeing], w[agreeing])
+    weights = _weights([one for one, agrees in zip(given, agreeing, strict=True) if agrees])
+    a, b = _fit_complex_line(z[agreeing], w[agreeing], weights)
     places = np.unique(np.round(enu[:, :2], 2), axis=0)
     used = len(np.unique(np.round(enu[agreeing, :2], 2), axis=0))
     if used < max(MIN_POSITIONS, OPTIONS.min_share * len(places)):
         return Rejected(f"only {used} of {len(places)} GPS positions agree with the cameras within {limit:.0f} m")
-    rms = float(np.sqrt(np.mean(np.abs(a * z[agreeing] + b - w[agreeing]) ** 2)))
-    extent = float(np.std(w[agreeing]))
+    rms = float(np.sqrt(weights @ np.abs(a * z[agreeing] + b - w[agreeing]) ** 2))
+    extent = float(np.sqrt(weights @ np.abs(w[agreeing] - weights @ w[agreeing]) ** 2))
+    count = min(used, 1.0 / float(weights @ weights))  # of equal weights (Kish 1965)
     unexplained = min((rms / extent) ** 2, 1.0) if extent > 0 else 1.0
-    deviation = np.sqrt(unexplained / max(1.0 - unexplained, 1e-12) / (2 * (used - 2)))
+    deviation = np.sqrt(unexplained / max(1.0 - unexplained, 1e-12) / (2 * (count - 2)))
     # for positions unrelated to the cameras, `unexplained` has the distribution function u^(n-2): Beta(n - 2, 1)
-    if unexplained ** (used - 2) > OPTIONS.significance or deviation > OPTIONS.max_scale_deviation:
+    if unexplained ** (count - 2) > OPTIONS.significance or deviation > OPTIONS.max_scale_deviation:
         return Rejected(
             f"{used} GPS positions with a spread of {extent:.0f} m and residuals of {rms:.1f} m "
             "do not determine a scale"
@@ -164,7 +171,7 @@ def _fit_on_ground(
     R = np.array([[c.real, -c.imag, 0.0], [c.imag, c.real, 0.0], [0.0, 0.0, 1.0]]) @ np.stack([*axes, up])
     height = float(np.median(enu[:, 2] - scale * cameras @ up))
     fit = Similarity(scale, R, np.array([b.real, b.imag, height]))
-    return Georeference(fit, origin, used, len(places), rms, float(deviation))
+    return Georeference(fit, _median_position(given), used, len(places), rms, float(deviation))
 
 
 def _inlier_mask(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float) -> NDArray[np.bool_]:
@@ -187,11 +194,24 @@ def _inlier_mask(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: fl
     return best
 
 
-def _fit_complex_line(z: NDArray[np.complex128], w: NDArray[np.complex128]) -> tuple[complex, complex]:
+def _weights(positions: Sequence[GpsPosition]) -> FloatArray:
+    """Return weights (N,) of positions by their deviations, with the sum 1; equal ones if only few would count."""
+    deviations = [one.deviation_m or OPTIONS.deviation_m for one in positions]
+    weights = 1.0 / np.maximum(deviations, OPTIONS.min_deviation_m) ** 2
+    weights /= weights.sum()
+    few = 1.0 / (weights @ weights) < MIN_POSITIONS + 1
+    return np.full(len(weights), 1.0 / len(weights)) if few else np.asarray(weights)
+
+
+def _fit_complex_line(
+    z: NDArray[np.complex128], w: NDArray[np.complex128], weights: FloatArray | None = None
+) -> tuple[complex, complex]:
     """Fit a and b of w = a z + b by least squares."""
-    centered = z - z.mean()
-    a = complex(np.vdot(centered, w - w.mean()) / max(float(np.vdot(centered, centered).real), 1e-300))
-    return a, complex(w.mean() - a * z.mean())
+    middle, target = np.average(z, weights=weights), np.average(w, weights=weights)
+    centered = z - middle
+    weighted = centered if weights is None else weights * centered
+    a = complex(np.vdot(weighted, w - target) / max(float(np.vdot(weighted, centered).real), 1e-300))
+    return a, complex(target - a * middle)
 
 
 def _up_from_positions(

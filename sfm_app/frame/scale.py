@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from sfm_app.frame.coordinates import MapFrame
 from sfm_app.geometry.poses import Similarity
-from sfm_app.types import Model, PosedPhoto
+from sfm_app.types import MapPlace, Model, PosedPhoto
 
 GPS = "GPS of the photos"
 CONTRADICTION = 4.0
@@ -40,12 +41,8 @@ class MetricFrame:
     evidence: tuple[ScaleEvidence, ...] = ()
     contradictions: tuple[str, ...] = ()
     """Evidence that contradicts the rest, one sentence each."""
-    crs: str = ""
-    """Coordinate system of ground control points; empty without any."""
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Position of the frame's origin in that system: x is east, y up and z south of it."""
-    units_per_m: tuple[float, float] = (1.0, 1.0)
-    """Units of that system per meter, horizontal and vertical."""
+    place: MapPlace | None = None
+    """Place of the frame, by ground control points or else GPS."""
 
     @property
     def is_metric(self) -> bool:
@@ -58,11 +55,11 @@ class MetricFrame:
         return self.from_model is not IDENTITY
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
+        """Return plain values for JSON, with the transformation to the map for readers."""
         values, similarity = asdict(self), self.from_model
         del values["from_model"]
         frame = {"scale": similarity.scale, "R": similarity.R.tolist(), "t": similarity.t.tolist()}
-        return frame | {"unit": "meter" if self.is_metric else "arbitrary"} | values
+        return frame | {"unit": "meter" if self.is_metric else "arbitrary"} | values | map_entry(self.place)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "MetricFrame":
@@ -70,18 +67,24 @@ class MetricFrame:
         R, t = np.array(values["R"], np.float64), np.array(values["t"], np.float64)
         similarity = Similarity(float(values["scale"]), R, t)
         unchanged = similarity.scale == 1.0 and (np.eye(3) == R).all() and not t.any()
-        east, north, up = map(float, values["offset"])
-        horizontal, vertical = map(float, values["units_per_m"])
         return cls(
             IDENTITY if unchanged else similarity,
             values["deviation"],
             values["source"],
             tuple(ScaleEvidence(**one) for one in values["evidence"]),
             tuple(values["contradictions"]),
-            values["crs"],
-            (east, north, up),
-            (horizontal, vertical),
+            read_place(values["place"]),
         )
+
+
+def map_entry(place: MapPlace | None) -> dict[str, Any]:
+    """Return the transformation from a frame to the map for records of files; empty where its place is unknown."""
+    return {"map": MapFrame(place).to_dict()} if place else {}
+
+
+def read_place(values: Mapping[str, Any] | None) -> MapPlace | None:
+    """Return the place of `asdict`, also by way of JSON."""
+    return MapPlace(**{**values, "origin": tuple(values["origin"])}) if values else None
 
 
 def agree(evidence: Sequence[ScaleEvidence], shape: float = 0.0) -> MetricFrame:

@@ -21,6 +21,7 @@ from sfm_app.colmap.model import (
     viewing_rays,
 )
 from sfm_app.errors import NumericalError
+from sfm_app.frame.coordinates import GPS_SYSTEM
 from sfm_app.frame.georeference import Georeference, georeference, position_from_enu
 from sfm_app.frame.up_cues import CUE_OPTIONS
 from sfm_app.frame.up_direction import LINES, Scenery, UpEstimate, odds, up_direction, viewer_direction, viewer_frame
@@ -28,7 +29,7 @@ from sfm_app.frame.vanishing_points import Segments, concatenate_segments, line_
 from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import FAILURES, Json, error_reason
 from sfm_app.runtime.context import RunContext
-from sfm_app.types import GpsPosition, MatchGraph, Rejected
+from sfm_app.types import GpsPosition, MapPlace, MatchGraph, Rejected
 from sfm_app.types.arrays import FloatArray
 
 logger = logging.getLogger("sfm_app")
@@ -182,6 +183,19 @@ def gps_deviation(orientation: Mapping[str, Json]) -> float | None:
     return float(percent) / 100.0 if isinstance(percent, int | float) else None
 
 
+def gps_place(orientation: Mapping[str, Json]) -> MapPlace | None:
+    """Return the place of the model by GPS, from the manifest's entry; None if it is unknown.
+
+    Without altitudes, heights count from the median of the cameras.
+    """
+    entry = orientation.get("georeference")
+    if not isinstance(entry, Mapping):
+        return None
+    keys = ("longitude_deg", "latitude_deg", "altitude_m", "heading_deg")
+    x, y, z, heading_deg = (float(str(entry[key] or 0.0)) for key in keys)
+    return MapPlace(GPS_SYSTEM, (x, y, z), heading_deg)
+
+
 def _georeference_entry(viewer: Similarity, gps: Georeference | Rejected) -> dict[str, Json]:
     if isinstance(gps, Rejected):
         return {"unit": "about the size of the scene", "gps": f"not used: {gps.reason}"}
@@ -192,10 +206,10 @@ def _georeference_entry(viewer: Similarity, gps: Georeference | Rejected) -> dic
         "unit": "meter",
         "gps": f"{gps.inliers} of {gps.positions} positions agree",
         "georeference": {
-            "latitude_deg": round(origin.latitude_deg, 8),
-            "longitude_deg": round(origin.longitude_deg, 8),
-            "altitude_m": None if origin.altitude_m is None else round(origin.altitude_m, 2),
-            "heading_deg": round(float(np.degrees(np.arctan2(east, north))) % 360.0, 3),
+            "latitude_deg": round(origin.latitude_deg, 10),
+            "longitude_deg": round(origin.longitude_deg, 10),
+            "altitude_m": None if origin.altitude_m is None else round(origin.altitude_m, 4),
+            "heading_deg": round(float(np.degrees(np.arctan2(east, north))) % 360.0, 7),
             "scale_deviation_percent": round(100 * gps.scale_deviation, 2),
             "residual_m": round(gps.rms_m, 2),
         },

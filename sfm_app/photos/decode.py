@@ -11,6 +11,7 @@ from functools import cache, lru_cache
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
+from types import MappingProxyType
 from typing import Any, BinaryIO, Literal
 
 import cv2
@@ -25,7 +26,7 @@ from sfm_app.operating_system import find_in_wheel
 from sfm_app.photos.files import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
 from sfm_app.types import CameraPrior, GpsPosition
 from sfm_app.types.arrays import BoolArray
-from sfm_app.types.photos import EXIF
+from sfm_app.types.photos import EXIF, SEA_LEVEL, TAKE_OFF
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
 """Formats that every Pillow can read."""
@@ -96,14 +97,95 @@ def _sensor_focal(details: Mapping[int, Any]) -> float:
     return float(details[Base.FocalLength]) * float(details[Base.FocalPlaneXResolution]) / unit_mm / longer_px
 
 
-def gps_position(exif: Image.Exif) -> GpsPosition | None:
-    """Return the GPS position; None if it is missing, implausible, or 0, 0, which cameras without a fix write."""
+def gps_position(exif: Image.Exif, xmp: Mapping[str, str] = MappingProxyType({})) -> GpsPosition | None:
+    """Return the position by EXIF, or by XMP where EXIF has none or a coarser one.
+
+    None if it is missing, implausible, or 0, 0, which cameras without a fix write.
+    """
     entries: Mapping[int, Any] = exif.get_ifd(IFD.GPSInfo)
-    latitude = _degrees(entries.get(GPS.GPSLatitude), entries.get(GPS.GPSLatitudeRef), "NS", 90.0)
-    longitude = _degrees(entries.get(GPS.GPSLongitude), entries.get(GPS.GPSLongitudeRef), "EW", 180.0)
+    drone = {name.partition(":")[2].lower(): text for name, text in xmp.items() if name.startswith(DRONES)}
+    given = [entries.get(tag) for tag in (GPS.GPSLatitude, GPS.GPSLongitude)]
+    latitude = _degrees(given[0], entries.get(GPS.GPSLatitudeRef), "NS", 90.0)
+    longitude = _degrees(given[1], entries.get(GPS.GPSLongitudeRef), "EW", 180.0)
+    north = _xmp_degrees(drone.get("gpslatitude", ""), "NS", 90.0)
+    east = _xmp_degrees(drone.get("gpslongitude") or drone.get("gpslongtitude", ""), "EW", 180.0)  # DJI misspelt it
+    known = latitude is not None and longitude is not None
+    if north and east and not (known and max(north[1], east[1]) >= max(map(_step_deg, given))):
+        latitude, longitude = north[0], east[0]
     if latitude is None or longitude is None or latitude == longitude == 0.0:
         return None
-    return GpsPosition(latitude, longitude, _altitude_m(entries.get(GPS.GPSAltitude), entries.get(GPS.GPSAltitudeRef)))
+    altitude, zero = _find_altitude(entries, drone)
+    deviation = _largest(drone, "rtkstdlat", "rtkstdlon", "gpsxyaccuracy")
+    return GpsPosition(latitude, longitude, altitude, zero, deviation, _largest(drone, "rtkstdhgt", "gpszaccuracy"))
+
+
+def _find_altitude(entries: Mapping[int, Any], drone: Mapping[str, str]) -> tuple[float | None, str]:
+    """Return the altitude by EXIF's and XMP's entries, and what it counts from: the take-off if no other is known."""
+    claims = (
+        (_number(drone.get("absolutealtitude", "")), 0, SEA_LEVEL),
+        (entries.get(GPS.GPSAltitude), entries.get(GPS.GPSAltitudeRef), SEA_LEVEL),
+        (_number(drone.get("gpsaltitude", "")), int(drone.get("gpsaltituderef") == "1"), SEA_LEVEL),
+        (_number(drone.get("relativealtitude", "")), 0, TAKE_OFF),
+    )
+    known = ((_altitude_m(value, reference), zero) for value, reference, zero in claims)
+    return next((one for one in known if one[0] is not None), (None, SEA_LEVEL))
+
+
+DRONES = ("drone-dji:", "drone-parrot:", "Camera:", "sensefly:", "exif:")
+"""Prefixes of positions in XMP: DJI, Parrot, Pix4D for senseFly, Parrot and MicaSense, and EXIF's own names."""
+XMP_DEGREES = re.compile(
+    r"([+-]?\d{1,3}(?:\.\d+)?)(?:,(\d{1,2}(?:\.\d+)?))?(?:,(\d{1,2}(?:\.\d+)?))? ?([NSEW]?)", re.ASCII
+)
+"""Degrees with a sign, or degrees, minutes and perhaps seconds with the letter of the hemisphere."""
+XMP_ENTRY = re.compile(
+    rb"""<([\w-]{1,40}:\w{1,60})\s{0,9}>([^<]{0,200})</|([\w-]{1,40}:\w{1,60})\s{0,9}=\s{0,9}["']([^"'<]{0,200})["']"""
+)
+"""An entry of XMP, as an element or as an attribute; lengths are bounded, since files may be damaged or hostile."""
+MOST_XMP_BYTES = 262_144
+"""Bytes of XMP that are searched, four times what one segment of a JPEG holds. By hand."""
+
+
+def xmp_entries(image: Image.Image, exif: Image.Exif | None = None) -> dict[str, str]:
+    """Return the texts of a decoded picture's XMP, or that of its EXIF, by prefix and name; empty without."""
+    keys = ("xmp", "XML:com.adobe.xmp")  # older versions of Pillow call that of PNG so
+    xmp = next((image.info[key] for key in keys if image.info.get(key)), None) or (
+        exif.get(Base.XMLPacket) if exif else None
+    )
+    data = xmp.encode() if isinstance(xmp, str) else xmp if isinstance(xmp, bytes) else b""
+    entries = ((a or c, b or d) for a, b, c, d in XMP_ENTRY.findall(data[:MOST_XMP_BYTES]))
+    return {name.decode(): value.decode(errors="replace").strip() for name, value in entries}
+
+
+def _xmp_degrees(text: str, sides: str, largest: float) -> tuple[float, float] | None:
+    """Return signed degrees of XMP and the step to which they are rounded."""
+    match = XMP_DEGREES.fullmatch(text)
+    if not match or match[4] not in ("", *sides):
+        return None
+    parts = [(float(part), 60.0**-k, len(part.partition(".")[2])) for k, part in enumerate(match.groups()[:3]) if part]
+    size = sum(abs(value) * unit for value, unit, _ in parts)
+    sign = -1.0 if text.startswith("-") or match[4] == sides[1] else 1.0
+    return (sign * size, min(unit * 10.0**-decimals for _, unit, decimals in parts)) if size <= largest else None
+
+
+def _step_deg(parts: Any) -> float:
+    """Return the step to which EXIF rounds degrees, minutes and seconds."""
+    return min(60.0**-k / max(getattr(part, "denominator", 1), 1) for k, part in enumerate(parts))
+
+
+def _number(text: str) -> float | None:
+    """Return a finite number or fraction of XMP; None for other texts."""
+    try:
+        above, _, below = text.partition("/")
+        value = float(above) / float(below or 1)
+    except (ValueError, ZeroDivisionError):
+        return None
+    return value if np.isfinite(value) else None
+
+
+def _largest(drone: Mapping[str, str], *names: str) -> float | None:
+    """Return the largest deviation in meters that XMP names; None without one above zero."""
+    known = (_number(drone.get(name, "")) for name in names)
+    return max((one for one in known if one is not None and 0.0 < one < 1e4), default=None)
 
 
 def printable_text(value: object) -> str:

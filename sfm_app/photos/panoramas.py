@@ -1,7 +1,6 @@
 """Panoramas of 360 degrees: recognition, and perspective views of them."""
 
 import math
-import re
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -10,22 +9,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from PIL.ExifTags import Base
 
 from sfm_app.camera.bearings import bearings, project
 from sfm_app.camera.models import panorama_camera
 from sfm_app.camera.perspective_views import PerspectiveView, cover_rays
 from sfm_app.camera.projection import RAY
-from sfm_app.photos.decode import DecodedPhoto, UnreadableError
+from sfm_app.photos.decode import DecodedPhoto, UnreadableError, xmp_entries
 from sfm_app.types.arrays import FloatArray
 
 # Recognition of equirectangular photos, whose columns are longitudes and whose rows are latitudes. Ours.
 # Cameras and stitchers name the projection in the file (Google's Photo Sphere metadata, `GPano`). Without metadata, a
 # full panorama is twice as wide as high, its left and right borders continue each other, and its first and last row
 # each show one point: zenith and nadir.
-
-ENTRY = re.compile(rb"""<GPano:(\w+)[^>]*>([^<]*)</|GPano:(\w+)\s*=\s*["']([^"']*)""")
-"""An entry of Google's metadata, as an element or as an attribute."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,16 +74,7 @@ def is_panorama(picture: DecodedPhoto, upright: Image.Image) -> bool:
 
 def read_panorama_entries(image: Image.Image) -> dict[str, str]:
     """Return the entries of Google's Photo Sphere metadata of a decoded image by name; empty without."""
-    keys = ("xmp", "XML:com.adobe.xmp")  # of JPEG and WebP; of PNG
-    xmp = next((image.info[key] for key in keys if image.info.get(key)), None)
-    if xmp is None and image.format == "TIFF":
-        xmp = getattr(image, "tag_v2", {}).get(Base.XMLPacket)
-    if isinstance(xmp, str):
-        xmp = xmp.encode()
-    if not isinstance(xmp, bytes):
-        return {}
-    entries = ((a or c, b or d) for a, b, c, d in ENTRY.findall(xmp))
-    return {name.decode(): value.decode(errors="replace").strip() for name, value in entries}
+    return {name[6:]: value for name, value in xmp_entries(image).items() if name.startswith("GPano:")}
 
 
 def looks_like_panorama(upright: Image.Image) -> bool:

@@ -24,6 +24,7 @@ from sfm_app.photos.decode import (
     rotate_to_sensor,
     turn_deg,
     upright_image,
+    xmp_entries,
 )
 from sfm_app.photos.files import resolve_file
 from sfm_app.photos.panoramas import is_panorama
@@ -31,6 +32,7 @@ from sfm_app.photos.selection import PhotoStats, measure_photo
 from sfm_app.settings import PhotoSettings
 from sfm_app.types import Frame, GivenCameras, Photo, UnusablePhoto
 from sfm_app.types.camera import EQUIRECTANGULAR, PERSPECTIVE
+from sfm_app.types.photos import FILE, SEA_LEVEL, TAKE_OFF
 
 # Bars of one color around a picture, which services add to bring photos of any size to one size.
 # The picture within the bars is the photo: its size distinguishes cameras, and the principal point usually lies near
@@ -184,7 +186,7 @@ def describe(name: str, picture: DecodedPhoto, options: PhotoSettings) -> PhotoS
         group=camera_name(exif),
         prior=None if panorama else exif_prior(exif, max(width, height)),
         needs_copy=(width, height) != size or not _is_read_by_colmap(picture),
-        gps=gps_position(exif),
+        gps=gps_position(exif, xmp_entries(image, exif)),
         lossy=image.format in LOSSY,
         turn_deg=turn,
         notes=_notes(picture, size, (width, height), panorama=panorama),
@@ -252,6 +254,18 @@ def _complete_panoramas(photos: Sequence[Photo]) -> list[Photo]:
     sizes = {size for size, count in panoramas.items() if count > counts[size] / 2 and size[0] == 2 * size[1]}
     return [
         replace(photo, projection=EQUIRECTANGULAR) if (photo.width, photo.height) in sizes else photo
+        for photo in photos
+    ]
+
+
+def with_one_zero(photos: Sequence[Photo]) -> list[Photo]:
+    """Return the photos with altitudes from one zero: the user's file, else the more common one; others are dropped."""
+    zeros = Counter(photo.gps.zero for photo in photos if photo.gps and photo.gps.altitude_m is not None)
+    zero = FILE if FILE in zeros else TAKE_OFF if zeros[TAKE_OFF] > zeros[SEA_LEVEL] else SEA_LEVEL
+    return [
+        replace(photo, gps=replace(photo.gps, altitude_m=None, zero=zero, altitude_deviation_m=None))
+        if photo.gps and photo.gps.zero != zero
+        else photo
         for photo in photos
     ]
 

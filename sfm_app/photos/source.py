@@ -3,7 +3,7 @@
 import filecmp
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from stat import S_ISREG
 from typing import Any
@@ -17,7 +17,7 @@ from sfm_app.photos.decode import UnreadableError, large_photo_lock, read_pictur
 from sfm_app.photos.files import is_video, list_photos, read_head, resolve_file
 from sfm_app.photos.masks import list_masks, split_mask_path
 from sfm_app.settings import PhotoSettings
-from sfm_app.types import Photo, PhotoSet
+from sfm_app.types import GpsPosition, Photo, PhotoSet
 
 Stamp = tuple[int, int]
 """Size in bytes, and time of the last change in nanoseconds."""
@@ -44,11 +44,15 @@ class Source:
     """True where the user gave one file for all photos."""
     stamps: Mapping[Path, Stamp]
     """Sizes and times of the files, to detect later changes."""
+    positions: Mapping[str, GpsPosition] = field(default_factory=dict)
+    """By the user's file, by name of the photo."""
 
     @property
     def fingerprint(self) -> str:
         """Hash of the path, the files and the masks."""
-        return fingerprint(str(self.path.resolve()), self.files, self.left_out, self.masks, self.one_mask)
+        return fingerprint(
+            str(self.path.resolve()), self.files, self.left_out, self.masks, self.one_mask, self.positions
+        )
 
     def content_hash(self, photos: PhotoSet) -> str:
         """Return a hash of the used photos and their masks, without camera groups, which do not affect features."""

@@ -16,7 +16,7 @@ from sfm_app.operating_system import is_link
 from sfm_app.photos.decode import UnreadableError
 from sfm_app.photos.files import list_files
 from sfm_app.photos.masks import MASK_HINT, assign_masks, check_mask, lay_out_mask, mask_path, unused_masks
-from sfm_app.photos.probe import group_by_camera, read_photo, split_by_given_camera
+from sfm_app.photos.probe import group_by_camera, read_photo, split_by_given_camera, with_one_zero
 from sfm_app.photos.selection import PhotoStats, drop_duplicates, drop_unusable, read_stats, write_stats
 from sfm_app.photos.source import Source, assign_names, is_laid_out, lay_out
 from sfm_app.photos.video import MOST_PIXELS, CornerTracker, open_video, select_keyframes
@@ -175,7 +175,8 @@ def _read_photos(
             hint="at least two photos of a place are needed; 10 to 50 work best",
             photos={photo.name: photo.reason for photo in unusable},
         )
-    timed = [replace(photo, time_s=times_s.get(photo.path)) for photo in photos]
+    known = [replace(photo, gps=source.positions.get(photo.path, photo.gps)) for photo in photos]
+    timed = [replace(photo, time_s=times_s.get(photo.path)) for photo in with_one_zero(known)]
     named = tuple(split_by_given_camera(list(assign_names(group_by_camera(timed, options.cameras))), run.given))
     photo_set = PhotoSet(folder, named, tuple(unusable), source.mask_dir)
     for place in (run.workspace.photos, run.workspace.masks):
@@ -189,7 +190,7 @@ def _read_photos(
     write_photo_list(photo_set, copies, run.workspace)
     run.record(usable=len(photos), cameras=len(photo_set.groups), unusable={p.name: p.reason for p in unusable})
     run.record(notes={photo.path: list(photo.notes) for photo in photos if photo.notes})
-    run.record(gps=sum(photo.gps is not None for photo in photos))
+    run.record(gps=sum(photo.gps is not None for photo in timed))
     return photo_set
 
 

@@ -46,6 +46,7 @@ def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
     shares = (one.deviations.get("fx", 0.0) / one.K[0, 0] for one in scene.cameras.values())
     shape = float(max((share for share in shares if np.isfinite(share)), default=0.0))
     frame = _agreed_frame(evidence, control, shape)
+    frame = frame if control else replace(frame, place=scene.gps_place)
     run.record(
         unit="meter" if frame.is_metric else "arbitrary",
         scale=frame.from_model.scale,
@@ -94,7 +95,7 @@ def _control_evidence(
         problems.append(f"ground control point '{name}' contradicts the others: it is {miss:.3g} m off, and left out")
     evidence.append(ScaleEvidence(f"{len(fit.inliers)} ground control points", fit.from_model.scale, fit.deviation))
     used = {"used": list(fit.inliers), "wrong": dict(fit.outliers), "rms_m": fit.rms_m}
-    run.record(control_points={"system": fit.crs, **used})
+    run.record(control_points={"system": fit.place.system, **used})
     return fit
 
 
@@ -108,7 +109,5 @@ def _agreed_frame(evidence: Sequence[ScaleEvidence], control: ControlFit | None,
         frame,
         from_model=control.from_model,
         deviation=max(float(np.hypot(control.deviation, shape)), difference),
-        crs=control.crs,
-        offset=control.offset,
-        units_per_m=control.units_per_m,
+        place=control.place,
     )

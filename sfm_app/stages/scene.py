@@ -12,7 +12,7 @@ from sfm_app.estimation.claims import camera_rules, refined_claims, report_claim
 from sfm_app.estimation.diagnosis import diagnose_depth, diagnose_scene
 from sfm_app.estimation.given_cameras import given_and_found, report_checks
 from sfm_app.files import mark_unfinished, resume_or_clear
-from sfm_app.frame.upright import gps_deviation, orient_or_keep, submit_cue_extraction
+from sfm_app.frame.upright import gps_deviation, gps_place, orient_or_keep, submit_cue_extraction
 from sfm_app.mapping.attempt import unregistered_reasons
 from sfm_app.mapping.hypotheses import reconstruct
 from sfm_app.mapping.look_alikes import jumps, look_alike_entries
@@ -97,7 +97,7 @@ def _finish_scene(outcome: Outcome, run: RunContext) -> Scene:
     ids = {names[image.name]: image.camera_id for image in posed_images(adjusted[0].model)}
     refined = {name: adjusted[0].refined[key] for name, key in ids.items()}
     scene = read_scene(run.workspace.sparse, names, reasons, refined)
-    scene = replace(scene, gps_deviation=gps_deviation(orientations[0]))
+    scene = replace(scene, gps_deviation=gps_deviation(orientations[0]), gps_place=gps_place(orientations[0]))
     write_scene(scene, run.workspace)
     lenses = {name: adjusted[0].lenses.get(key) for name, key in ids.items()}
     run.record(

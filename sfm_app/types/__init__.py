@@ -34,7 +34,7 @@ from sfm_app.types.photos import (
     PhotoSet,
     UnusablePhoto,
 )
-from sfm_app.types.scene import CameraModel, ControlPoint, ControlPoints, PosedPhoto, Scene, SceneArrays
+from sfm_app.types.scene import CameraModel, ControlPoint, ControlPoints, MapPlace, PosedPhoto, Scene, SceneArrays
 from sfm_app.types.surface import Model, Surface, Texture
 
 __all__ = [
@@ -53,6 +53,7 @@ __all__ = [
     "GpsPosition",
     "Intrinsics",
     "LookAlikes",
+    "MapPlace",
     "MatchGraph",
     "MatchedImage",
     "Model",

@@ -13,6 +13,8 @@ Frame = tuple[int, int, int, int]
 
 
 EXIF = "EXIF"
+SEA_LEVEL, TAKE_OFF, FILE = "sea level", "take-off", "file"
+"""What altitudes count from; that of the user's file is its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,14 +85,19 @@ def _median(claims: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class GpsPosition:
-    """Where a photo was taken according to EXIF (WGS84)."""
+    """Where a photo was taken according to EXIF, XMP or the user's file (WGS84)."""
 
     latitude_deg: float
     """North of the equator, [-90, 90]."""
     longitude_deg: float
     """East of Greenwich, [-180, 180]."""
     altitude_m: float | None = None
-    """Above sea level; None where unknown."""
+    """Above `zero`; None where unknown."""
+    zero: str = SEA_LEVEL
+    """What altitudes count from: `SEA_LEVEL`, `TAKE_OFF` or `FILE`. Those of one set of photos have the same."""
+    deviation_m: float | None = None
+    """Standard deviation of each horizontal coordinate; None for that of common receivers."""
+    altitude_deviation_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

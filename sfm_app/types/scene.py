@@ -105,6 +105,18 @@ def camera_center(cam_from_world: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True)
+class MapPlace:
+    """Where a frame in meters with y up lies on Earth."""
+
+    system: str
+    """Coordinate system of the origin, as the user named it."""
+    origin: tuple[float, float, float]
+    """Position of (0, 0, 0) in that system, east or longitude first."""
+    heading_deg: float = 0.0
+    """Direction of -z, clockwise from north, or from the north of a conformal grid."""
+
+
+@dataclass(frozen=True, slots=True)
 class Scene:
     """A COLMAP model on disk, with the figures of its summary."""
 
@@ -122,6 +134,8 @@ class Scene:
     """Name of the camera by photo that has a pose."""
     gps_deviation: float | None = None
     """Relative standard deviation of the unit where GPS makes it the meter; None: the unit is arbitrary."""
+    gps_place: MapPlace | None = None
+    """Place of the model by GPS."""
 
     @property
     def registered(self) -> tuple[str, ...]:

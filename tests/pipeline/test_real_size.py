@@ -1,9 +1,11 @@
 """Real size by markers, distances and ground control points, from photos to exported files."""
 
 import json
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
+import laspy
 import numpy as np
 import pycolmap
 import pytest
@@ -154,11 +156,10 @@ def test_control_points_give_size_and_place(measured, tmp_path):
     run = again(measured, control_points=str(marks_file(measured, tmp_path / "gcp_list.txt", GROUND[:5])))
     found = read_scale(measured.out)
     assert_scale(found, true_similarity(measured).scale, within=0.007)
-    assert found["crs"] == "EPSG:32632"
+    assert found["map"]["system"] == "EPSG:32632"
     frame = Similarity(found["scale"], np.array(found["R"]), np.array(found["t"]))
     for name, pose in run.scene.cam_from_world.items():
-        x, y, z = frame(camera_center(pose))
-        east_north_up = np.array([x, -z, y]) * [*2 * found["units_per_m"][:1], 1.0] + found["offset"]
+        east_north_up = (np.array(found["map"]["transform"]) @ [*frame(camera_center(pose)), 1.0])[:3]
         assert np.linalg.norm(east_north_up - to_utm(camera_center(measured.truth.cam_from_world[name]))) < 0.03
 
 
@@ -183,7 +184,7 @@ def test_control_points_in_feet_give_the_same_size(measured, tmp_path):
     path.write_text("\n".join(["EPSG:2263", *marks]), encoding="utf-16")  # as PowerShell writes
     run = again(measured, control_points=str(path))
     assert_scale(read_scale(measured.out), true_similarity(measured).scale, within=0.007)
-    assert read_scale(measured.out)["crs"] == "EPSG:2263"
+    assert read_scale(measured.out)["map"]["system"] == "EPSG:2263"
     assert run.manifest["stages"]["scale"]["counts"]["problems"] == []
 
 
@@ -207,3 +208,34 @@ def test_markers_that_are_not_there_leave_the_unit_as_it_was(measured):
     assert run.manifest["stages"]["scale"]["counts"]["problems"] == [
         "no photo shows a marker; print a page of them with `sfm-app markers`"
     ]
+
+
+def test_a_file_of_positions_puts_the_cloud_on_the_map(measured, tmp_path):
+    """The scene counts as 20 times as large, so that GPS determines its size."""
+    photos, out = shutil.copytree(measured.photos, tmp_path / "photos"), tmp_path / "out"
+    true = {name: 20.0 * camera_center(pose) for name, pose in measured.truth.cam_from_world.items()}
+    lines = [f"{name} {' '.join(f'{x:.3f}' for x in to_utm(place))}" for name, place in sorted(true.items())]
+    (photos / "geo.txt").write_text("\n".join(["EPSG:32632", *lines, "gone.jpg 500000 4649000 320"]), encoding="utf-8")
+    small = {"depth": {"max_image_size_px": 160}, "matching": {"max_image_size_px": 480}, "mesh": {"faces": 1000}}
+    settings = Settings.from_mapping({"quality": "draft", "report": False, **small})
+    said = []
+    run = sfm_app.reconstruct(photos, out, settings, last="mesh", progress=lambda step: said.append(step.label))
+    assert any("gone.jpg" in text for text in said)
+    assert run.manifest["stages"]["photos"]["counts"]["gps"] == len(true)
+    assert not run.manifest["stages"]["photos"]["counts"]["unusable"]
+
+    sfm_app.export_model(out, target=tmp_path / "files" / "points.glb", points=True)
+    here = json.loads((tmp_path / "files" / "export.json").read_text())["map"]
+    assert here["system"] == "EPSG:32632"
+    cameras = run.scene.arrays
+    centers = np.column_stack([cameras.centers, np.ones(len(cameras.photos))]) @ np.array(here["transform"]).T
+    wanted = np.array([to_utm(true[name]) for name in cameras.photos])
+    assert np.abs(centers[:, :3] - wanted).max() < 0.3
+
+    cloud, plain = (sfm_app.export_scene(out, name, tmp_path / "files") for name in ("laz", "cloud-ply"))
+    near = np.array(trimesh.load(plain).vertices, np.float64)
+    mapped = np.column_stack([near, np.ones(len(near))]) @ np.array(here["transform"]).T
+    read = laspy.read(cloud)
+    assert np.abs(read.xyz - mapped[:, :3]).max() < 0.001 + 1e-6 * np.abs(near).max()
+    assert read.header.parse_crs().to_epsg() == 32632
+    assert np.ptp(read.z) < np.ptp(read.x)  # z is up

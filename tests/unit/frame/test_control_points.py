@@ -11,7 +11,7 @@ from sfm_app.frame.control_points import (
     fit_control_points,
     read_control_points,
 )
-from sfm_app.frame.coordinates import LocalFrame, read_system
+from sfm_app.frame.coordinates import LocalFrame, MapFrame, read_system
 from sfm_app.frame.known_lengths import is_normalized, marks_in_pixels
 from sfm_app.frame.sighted_points import SightedPoint
 from sfm_app.geometry.poses import Similarity
@@ -152,13 +152,10 @@ def test_five_points_give_the_place_and_the_size():
     found = fit_control_points(given, located)
     assert isinstance(found, ControlFit)
     assert found.from_model.scale == pytest.approx(TRUE.scale, rel=1e-9)
-    x, y, z = found.from_model(places).T
-    units, heights = found.units_per_m
-    assert units == pytest.approx(0.9996, rel=1e-4) and heights == 1.0
-    east_north_up = np.column_stack([units * x, -units * z, heights * y]) + found.offset
-    assert np.allclose(east_north_up, [point.position for point in given.points], atol=1e-4)
-    assert found.offset == tuple(np.round(found.offset))  # whole meters
-    assert found.crs == "EPSG:32632"
+    mapped = MapFrame(found.place).positions(found.from_model(places))
+    assert np.allclose(mapped, [point.position for point in given.points], atol=1e-4)
+    assert found.place.origin == tuple(np.round(found.place.origin))  # whole meters
+    assert found.place.system == "EPSG:32632"
 
 
 @pytest.mark.parametrize("count", [4, 8])

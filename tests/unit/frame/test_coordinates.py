@@ -5,7 +5,7 @@ import pytest
 
 from sfm_app.errors import InputError
 from sfm_app.frame.control_points import ControlFit, fit_control_points, read_control_points
-from sfm_app.frame.coordinates import LocalFrame, read_system
+from sfm_app.frame.coordinates import LocalFrame, MapFrame, read_system
 from sfm_app.frame.sighted_points import SightedPoint
 from sfm_app.synthetic.cameras import axis_rotation
 
@@ -174,17 +174,14 @@ def test_size_and_place_in_a_system(tmp_path, header):
     assert isinstance(fit, ControlFit) and not fit.outliers
     assert fit.from_model.scale == pytest.approx(SCALE, rel=2e-5)
     assert fit.rms_m < 2e-3
-    x, y, z = fit.from_model(np.array([located[f"p{k}"].place for k in range(len(enu))])).T
-    horizontal, vertical = fit.units_per_m
-    if fit.crs.startswith("meters"):
-        assert np.allclose(
-            np.column_stack([x, -z, y]) - enu, np.mean(np.column_stack([x, -z, y]) - enu, axis=0), atol=0.01
-        )
-        assert fit.offset == (0.0, 0.0, 0.0)
+    found = fit.from_model(np.array([located[f"p{k}"].place for k in range(len(enu))]))
+    x, y, z = found.T
+    if read_system(header).crs.is_projected:
+        assert np.allclose(MapFrame(fit.place).positions(found), positions, atol=0.005)
+        assert fit.place.origin == tuple(np.round(fit.place.origin))
     else:
-        mapped = np.column_stack([horizontal * x, -horizontal * z, vertical * y]) + fit.offset
-        assert np.allclose(mapped, positions, atol=0.005 if header != "EPSG:3857" else 0.4)
-        assert fit.offset == tuple(np.round(fit.offset))
+        moved = np.column_stack([x, -z, y]) - enu
+        assert np.allclose(moved, moved.mean(axis=0), atol=0.01)
 
 
 def test_distances_of_web_mercator_are_not_those_on_the_ground():

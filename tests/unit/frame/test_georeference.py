@@ -141,3 +141,25 @@ def test_sound_positions_raise_no_alarm_also_on_a_line(place):
         noisy = enu + rng.normal(scale=3.0, size=enu.shape)
         found = georeference(enu @ R, [position_from_enu(row, origin) for row in noisy], up)
         assert found or "swapped" not in found.reason
+
+
+def test_positions_with_small_deviations_count_more():
+    errors = {False: [], True: []}
+    for seed in range(20):
+        centers, positions, up, enu = walk(20, 60.0, 4.0, seed)
+        for weighted, found in errors.items():
+            given = list(positions)
+            for k in range(0, 20, 2):  # half of them by RTK
+                exact = replace(position_from_enu(enu[k], ORIGIN), deviation_m=0.03 if weighted else None)
+                given[k] = exact
+            fit = georeference(centers, given, up)
+            found.append(abs(np.log(fit.enu_from_world.scale / METRES)))
+            assert found[-1] < 5 * fit.scale_deviation + 1e-6
+    assert np.median(errors[True]) < 0.1 * np.median(errors[False])
+
+
+def test_two_exact_positions_among_many_do_not_decide_alone():
+    centers, positions, up, _ = walk(12, 60.0, 3.0)
+    for k in (0, 1):
+        positions[k] = replace(positions[k], deviation_m=0.01)
+    assert georeference(centers, positions, up).enu_from_world.scale == pytest.approx(METRES, rel=0.1)

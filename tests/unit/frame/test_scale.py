@@ -8,6 +8,7 @@ import pytest
 from sfm_app.frame.scale import MetricFrame, ScaleEvidence, agree, move_model
 from sfm_app.geometry.poses import Similarity
 from sfm_app.synthetic.cameras import axis_rotation
+from sfm_app.types import MapPlace
 
 
 def pieces(scales, deviation=0.01):
@@ -55,15 +56,14 @@ FRAME = MetricFrame(
     "marker aruco-4x4 3",
     (ScaleEvidence("marker aruco-4x4 3", 3.5, 0.001, 4),),
     ("marker aruco-4x4 5 contradicts the 3 others",),
-    "EPSG:32632",
-    (500_000.0, 4_649_000.0, 320.0),
+    MapPlace("EPSG:32632", (500_000.0, 4_649_000.0, 320.0), 12.0),
 )
 
 
 @pytest.mark.parametrize("frame", [FRAME, MetricFrame()])
 def test_a_frame_is_read_back_as_it_was_written(frame):
     again = MetricFrame.from_dict(json.loads(json.dumps(frame.to_dict())))
-    assert again.to_dict() == frame.to_dict()
+    assert again.to_dict() == frame.to_dict() and again.place == frame.place
     assert again.is_metric == again.changes == (frame is FRAME)
 
 
