@@ -32,6 +32,11 @@ if TYPE_CHECKING:
 PathLike = str | os.PathLike[str]
 
 
+def as_paths(photos: PathLike | Sequence[PathLike]) -> list[Path]:
+    """Return one path or several as a list."""
+    return [Path(photos)] if isinstance(photos, str | os.PathLike) else [Path(path) for path in photos]
+
+
 @dataclass(frozen=True, eq=False)
 class RunScene(Scene):
     """The sparse reconstruction of a run: summary, cameras, poses; points and tracks on demand."""
@@ -102,7 +107,7 @@ def open_run(out: Path, settings: Settings, progress: Progress | Callback | None
 
 
 def reconstruct(
-    photos: PathLike, out: PathLike, settings: Settings | None = None, *,
+    photos: PathLike | Sequence[PathLike], out: PathLike, settings: Settings | None = None, *,
     first: str = "", last: str = "files", progress: Progress | Callback | None = None,
 ) -> Run:  # fmt: skip
     """Turn a folder of photos, or a video, into a mesh: OUT/model.ply and OUT/model.glb.
@@ -110,7 +115,7 @@ def reconstruct(
     Stages whose results in `out` are up to date are skipped.
 
     Args:
-        photos: folder with photos of one place, or a video; nothing about the camera needs to be known.
+        photos: folder with photos of one place, or a video, or several photos, folders and ZIP archives; nothing about the camera needs to be known.
         out: output folder; created if it does not exist.
         first: stage from which on all stages run again.
         last: last stage to run.
@@ -132,7 +137,7 @@ def reconstruct(
         run.plugins.depth_method(run.settings.depth.method)  # fail now, not halfway through the work
         targets = (pipeline.INTRINSICS, pipeline.SCENE, pipeline.FILES)
         try:
-            products = pipeline.run_stages(Path(photos), run, first, last, targets)
+            products = pipeline.run_stages(as_paths(photos), run, first, last, targets)
         except SfmError as err:
             if written := finish_report(run, err):
                 run.progress.say(f"report of the unfinished run: {written}")
@@ -189,7 +194,7 @@ def _as_run(run: RunContext, products: "Products", last: str, report: Path | Non
 
 
 def calibrate_photos(
-    photos: PathLike, settings: Settings | None = None, *,
+    photos: PathLike | Sequence[PathLike], settings: Settings | None = None, *,
     out: PathLike | None = None, figure: PathLike | None = None, progress: Progress | Callback | None = None,
 ) -> Intrinsics:  # fmt: skip
     """Find the camera matrix of a folder of photos, or of a video, without reconstructing the scene.
@@ -217,7 +222,7 @@ def calibrate_photos(
         open_run(Path(out or scratch), settings or Settings(), progress) as run,
     ):
         targets = (pipeline.MATCH_GRAPH, pipeline.VIEW_GRAPH, pipeline.INTRINSICS)
-        products = pipeline.run_stages(Path(photos), run, last=pipeline.INTRINSICS.name, targets=targets)
+        products = pipeline.run_stages(as_paths(photos), run, last=pipeline.INTRINSICS.name, targets=targets)
         intrinsics = products[pipeline.INTRINSICS]
         if figure is not None:
             draw_intrinsics(Path(figure), products[pipeline.MATCH_GRAPH], products[pipeline.VIEW_GRAPH], intrinsics)

@@ -10,9 +10,11 @@ from sfm_app.camera_files import read_given_cameras
 from sfm_app.colmap.dense import digest_maps
 from sfm_app.engine.execution import Pipeline
 from sfm_app.engine.stage import Products, Stage
+from sfm_app.errors import ConfigError
 from sfm_app.frame.control_points import read_control_points
 from sfm_app.frame.positions import GEO_TXT, read_positions
 from sfm_app.frame.scale import MetricFrame
+from sfm_app.photos.gather import expand, gather, is_single
 from sfm_app.photos.source import read_source
 from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.parallel import ordered_map
@@ -121,11 +123,18 @@ STAGES, NAMES = PIPELINE.stages, PIPELINE.names
 
 
 def run_stages(
-    photo_dir: Path, run: RunContext, first: str = "", last: str = "files", targets: Sequence[Stage[object]] = ()
+    inputs: Sequence[Path], run: RunContext, first: str = "", last: str = "files", targets: Sequence[Stage[object]] = ()
 ) -> Products:
-    """Turn a folder of photos, or a video, into products; the rest as in `Pipeline.run`."""
+    """Turn photos, folders and archives, or a video, into products; the rest as in `Pipeline.run`."""
     options, place = run.settings.photos, run.workspace
-    place.check_no_overlap(photo_dir)
+    inputs = expand(inputs)
+    for path in inputs:
+        place.check_no_overlap(path)
+    photo_dir = inputs[0] if is_single(inputs) else place.root / ".inputs"
+    if photo_dir not in inputs:
+        if options.images:
+            raise ConfigError("--images lists photos of one folder", hint="leave --images out")
+        gather(inputs, photo_dir, place.root)
     if options.masks:
         place.check_no_overlap(Path(options.masks), "masks")
     if run.settings.calibration.file:

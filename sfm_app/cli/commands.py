@@ -45,7 +45,7 @@ ENOUGH_DISK = 2 * GIGABYTE
 
 
 @click.command()
-@click.argument("photos", type=PATH)
+@click.argument("photos", type=PATH, nargs=-1, required=True)
 @click.option("-o", "--out", type=PATH, help="Output folder.  [default: PHOTOS-model beside PHOTOS]")
 @click.option(
     "--from",
@@ -60,17 +60,20 @@ ENOUGH_DISK = 2 * GIGABYTE
 )
 @settings_options
 @output_options
-def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: Any) -> None:
-    """Reconstruct PHOTOS, a folder or a video: cameras, poses and a textured mesh.
+def run(photos: tuple[Path, ...], out: Path | None, first: str | None, last: str, **flags: Any) -> None:
+    """Reconstruct PHOTOS, a folder, a video, or several photos, folders and ZIPs, as a textured mesh.
 
     The mesh is OUT/model.ply and OUT/model.glb. An interrupted run resumes: stages with up-to-date results in OUT are
     skipped.
     """
     from sfm_app.cli.outcome import outcome_lines, run_lines, run_steps, run_summary
     from sfm_app.cli.terminal import Terminal
+    from sfm_app.photos.gather import expand
 
     settings, start_s, quiet = settings_from_flags(flags), monotonic(), flags["quiet"]
-    folder = out or _default_folder(photos.resolve())
+    if out is None and len(expand(photos)) > 1:
+        raise ConfigError("several inputs have no folder for the results", hint="name one with -o")
+    folder = out or _default_folder(photos[0].resolve())
     with Terminal(quiet=quiet) as progress:
         result = sfm_app.reconstruct(photos, folder, settings, first=first or "", last=last, progress=progress)
     if flags["as_json"]:
@@ -79,7 +82,7 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
     seconds = monotonic() - start_s
     print_text(run_lines(result) if flags["verbose"] else outcome_lines(result, seconds))
     if not quiet and sys.stdout.isatty():
-        print_lines(run_steps(result, photos, out, settings))
+        print_lines(run_steps(result, photos[0], out, settings))
 
 
 def _default_folder(photos: Path) -> Path:
