@@ -115,7 +115,8 @@ def reconstruct(
     Stages whose results in `out` are up to date are skipped.
 
     Args:
-        photos: folder with photos of one place, or a video, or several photos, folders and ZIP archives; nothing about the camera needs to be known.
+        photos: folder with photos of one place, a video, or several photos, folders and ZIP
+            archives; nothing about the camera needs to be known.
         out: output folder; created if it does not exist.
         first: stage from which on all stages run again.
         last: last stage to run.

@@ -23,7 +23,7 @@ def expand(inputs: Sequence[Path]) -> list[Path]:
     """Return the inputs in order of their names, once each; a wildcard stands for its files."""
     found: set[Path] = set()
     for path in inputs:
-        matches = [] if path.exists() else [Path(name) for name in glob.glob(str(path), recursive=True)]
+        matches = [] if path.exists() else [Path(name) for name in glob.glob(str(path), recursive=True)]  # noqa: PTH207
         found |= set(matches or [path])
     return sorted({path.resolve(): path for path in sorted(found)}.values(), key=lambda path: str(path.resolve()))
 
