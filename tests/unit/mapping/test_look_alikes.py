@@ -105,8 +105,11 @@ class Walls:
         self.points = np.vstack([self.points, np.column_stack([x, y, np.full(count, away)])])
         return np.arange(len(self.points) - count, len(self.points))
 
-    def add_walk(self, photos, places, known, shift=0.0, zoom=1.0):
-        """Add photos with these ids at these places, which see the points that are known to them."""
+    def add_walk(self, photos, places, known, shift=0.0, zoom=1.0, matched=1):
+        """Add photos with these ids at these places, with features of the points that are known to them.
+
+        One of `matched` features has matches.
+        """
         camera, focal = min(photos), zoom * FOCAL
         self.model.add_camera_with_trivial_rig(
             pycolmap.Camera(model="SIMPLE_PINHOLE", width=WIDTH, height=HEIGHT,
@@ -122,7 +125,8 @@ class Walls:
                 image, pycolmap.Rigid3d(pycolmap.Rotation3d(np.eye(3)), -np.array([place, shift, 0.0]))
             )
             for row, number in enumerate(np.asarray(known)[inside]):
-                self.tracks.setdefault(int(number), []).append((photo, row))
+                if number % matched == 0:
+                    self.tracks.setdefault(int(number), []).append((photo, row))
 
     def finish(self):
         """Return the model, and the matches that it explains."""
@@ -172,6 +176,19 @@ def test_a_photo_expects_nothing_behind_what_it_sees(walls, behind, sides):
     walls.add_walk(range(11, 17), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=2, away=AWAY + behind))
     found = find_expected_overlaps(walls.finish()[0])
     assert (sides - 1) * 12 * 9 < found[3, 13].expected <= sides * 12 * 9
+
+
+@pytest.mark.slow
+def test_features_without_points_should_have_shown_those_of_others(walls):
+    """Where a photo has no features, nothing is expected of it: something plain may hide the wall."""
+    wall = walls.add_points(0, 9, seed=1)
+    walls.add_walk(range(1, 7), np.linspace(3, 6, 6), wall)
+    walls.add_walk((11,), (4.5,), wall, matched=30)
+    walls.add_walk((21,), (4.5,), wall[::30])
+    found = find_expected_overlaps(walls.finish()[0])
+    textured, plain = found[3, 11], found[3, 21]
+    assert textured.shared < 0.5 * textured.expected
+    assert plain.shared > 0.8 * plain.expected > 0
 
 
 @pytest.mark.slow
@@ -244,6 +261,24 @@ def test_photos_whose_matches_hold_are_no_strangers():
     overlaps = {(1, 2): ExpectedOverlap(50, 0), (1, 3): ExpectedOverlap(50, 0), (2, 3): ExpectedOverlap(50, 20)}
     found = find_non_overlapping(overlaps, {(1, 2): PairSupport(40, 40, 0), (1, 3): PairSupport(5, 5, 0)})
     assert set(found) == {(1, 3)}
+
+
+def wrong_side(usual, across):
+    """Overlaps of 20 photos, of which four stand on the wrong side of an object and have matches with all others."""
+    pairs = [(a, b) for a in range(20) for b in range(a + 1, 20)]
+    overlaps = {(a, b): ExpectedOverlap(50, across if a < 4 <= b else usual) for a, b in pairs}
+    explained = {(a, b): PairSupport(30 if a < 4 <= b else 200, 200, 0) for a, b in pairs}
+    return overlaps, explained
+
+
+def test_photos_on_the_wrong_side_of_a_symmetric_object_share_less_than_others():
+    (join,) = find_false_joins(*wrong_side(usual=48, across=15))
+    assert set(join.pairs) == {(a, b) for a in range(4) for b in range(4, 20)}
+    assert join.missing == pytest.approx(0.7)
+
+
+def test_where_all_photos_share_little_none_is_on_a_wrong_side():
+    assert find_false_joins(*wrong_side(usual=30, across=15)) == []
 
 
 @pytest.mark.slow
