@@ -170,7 +170,7 @@ class PosedPhotoPoints:
     rows: IndexArray
     """(N,) numbers of its points, ascending."""
     reach: FloatArray
-    """By cell, median distance of its points; inf where it has features without points, -1 where it has none."""
+    """By cell, median distance of its points; -1 without points."""
     witnessed: IndexArray
     """(M,) numbers of its points with enough witnesses."""
     rays: FloatArray
@@ -218,9 +218,7 @@ def _posed_photo_points(
     rays = points[rows] - center
     distances = np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
     cells = cell_numbers(x, camera.width, camera.height)
-    features = np.array([point.xy for point in image.points2D], np.float64)
-    counts = np.bincount(cell_numbers(features, camera.width, camera.height), minlength=(LOOK_ALIKES.cells + 1) ** 2)
-    reach = np.where(counts >= LOOK_ALIKES.min_cell_points, np.inf, -1.0)
+    reach = np.full((LOOK_ALIKES.cells + 1) ** 2, -1.0)
     for cell in np.unique(cells):
         reach[cell] = np.median(distances[cells == cell])
     return PosedPhotoPoints(
