@@ -6,7 +6,7 @@ import re
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 from io import BytesIO
 from pathlib import Path
@@ -261,63 +261,101 @@ def _install_handler() -> None:
 
 
 # libjpeg only warns of damaged data, which Pillow does not pass on: zeros or the data of another file are decoded to
-# the size of the photo, too. But then the data end before the last row, or go on after it.
+# the size of the photo, too. But then the data of a scan end before its last block, or go on after it.
 
 SPARE_BYTES = 64
 """Bytes that cameras may add after the last row; damage nearly always leaves more, or fewer than the rows need."""
-LOOK_AHEAD = bytes(16)
-"""The decoder reads so far ahead. The marker of the end would make it fill missing rows."""
+LOOK_AHEAD = b"\xff\0" * 8
+"""The decoder reads so far ahead. The marker of the end would make it fill missing rows; ones are no code."""
 NEXT_MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
 """End of the data of a scan: a marker that is neither a zero, which hides a byte of data, nor one of restarts."""
 
 
+@dataclass(slots=True)
+class _Jpeg:
+    """Parts of a JPEG; the first of several pictures."""
+
+    frame: bytes = b""
+    """Head with the size and the colors."""
+    coding: int = 0
+    """Marker of that head."""
+    interval: int = 0
+    """Units between two markers; 0 without markers."""
+    scans: list[tuple[bytes, int, int]] = field(default_factory=list)
+    """Colors of each scan, and where its data begin and end."""
+
+
+def _parse_jpeg(data: bytes) -> _Jpeg:
+    jpeg, at = _Jpeg(), 0
+    while (found := NEXT_MARKER.search(data, at)) and (marker := data[found.end() - 1]) != 0xD9:
+        at = found.end()
+        if marker == 0xD8:  # the start, which has no length
+            continue
+        at, start = at + int.from_bytes(data[at : at + 2], "big"), at + 2
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and not jpeg.frame:  # no tables
+            jpeg.frame, jpeg.coding = data[start:at], marker
+        elif marker == 0xDD:
+            jpeg.interval = int.from_bytes(data[start:at], "big")
+        elif marker == 0xDA:
+            end = NEXT_MARKER.search(data, at)
+            stop = end.start() if end else len(data)
+            jpeg.scans.append((data[start + 1 : start + 1 + 2 * data[start] : 2], at, stop))
+            at = stop
+    return jpeg
+
+
 def is_whole_jpeg(data: bytes) -> bool:
-    """Return whether the data of a JPEG end with its last row; progressive ones, which have many scans, are not asked.
+    """Return whether the data of each scan of a JPEG end with its last block.
 
     Where markers divide the data into intervals, they must be complete.
     """
-    at, interval, frame = 2, 0, b""
-    while (marker := data[at + 1]) != 0xDA:  # start of the scan
-        if data[at] != 0xFF:
-            return True  # libjpeg goes over bytes between segments
-        if marker == 0xFF:  # fills a gap
-            at += 1
-            continue
-        length = int.from_bytes(data[at + 2 : at + 4], "big")
-        if marker in (0xC0, 0xC1):
-            frame = data[at + 4 : at + 2 + length]
-        if marker == 0xDD:
-            interval = int.from_bytes(data[at + 4 : at + 6], "big")
-        at += 2 + length
-    if not frame or data[at + 4] != frame[5]:  # progressive, or a scan for each color
+    jpeg = _parse_jpeg(data)
+    if jpeg.coding not in (0xC0, 0xC1, 0xC2):
         return True
-    end = NEXT_MARKER.search(data, at + 2 + int.from_bytes(data[at + 2 : at + 4], "big"))
-    stop = end.start() if end else len(data)
-    if interval:
+    alone = jpeg.coding != 0xC2 and len(jpeg.scans) == 1
+    return all(_is_whole_scan(data, jpeg, scan, _gives_all_rows if alone else _ends_scan) for scan in jpeg.scans)
+
+
+def _is_whole_scan(
+    data: bytes, jpeg: _Jpeg, scan: tuple[bytes, int, int], is_enough: Callable[[bytes], bool]
+) -> bool:
+    colors, at, stop = scan
+    if jpeg.interval:
         found = re.findall(rb"\xff([\xd0-\xd7])", data[at:stop])
-        expected = (_count_units(frame) - 1) // interval
+        expected = (_count_units(jpeg.frame, colors) - 1) // jpeg.interval
         return found == [bytes([0xD0 + number % 8]) for number in range(expected)]
-    if not _gives_all_rows(data[:stop] + LOOK_AHEAD):
+    if not is_enough(data[:stop] + LOOK_AHEAD):
         return False
-    return stop - at <= 4 * SPARE_BYTES or not _gives_all_rows(data[: stop - SPARE_BYTES])
+    return stop - at <= 4 * SPARE_BYTES or not is_enough(data[: stop - SPARE_BYTES])
 
 
-def _count_units(frame: bytes) -> int:
-    """Return the number of units of a JPEG: squares of 8 pixels, or several where colors are coarser."""
+def _count_units(frame: bytes, colors: bytes) -> int:
+    """Return the number of units of a scan: squares of 8 pixels, or several where some of its colors are coarser."""
     height, width = int.from_bytes(frame[1:3], "big"), int.from_bytes(frame[3:5], "big")
-    factors = [(frame[7 + 3 * k] >> 4, frame[7 + 3 * k] & 15) for k in range(frame[5])]
-    across, down = (8 * max(pair) for pair in zip(*factors, strict=True)) if len(factors) > 1 else (8, 8)
-    return -(-width // across) * -(-height // down)
+    factors = {frame[6 + 3 * k]: (frame[7 + 3 * k] >> 4, frame[7 + 3 * k] & 15) for k in range(frame[5])}
+    own = factors[colors[0]] if len(colors) == 1 else (1, 1)
+    across, down = (8 * max(pair) for pair in zip(*factors.values(), strict=True))
+    return -(-width * own[0] // across) * -(-height * own[1] // down)
+
+
+def _ends_scan(data: bytes) -> bool:
+    """Return whether the decoder is done with the last of several scans: it then skips all bytes, for a marker."""
+    return all("(0 bytes" in _decoding_error(data + bytes(more)) for more in (0, 1))
 
 
 def _gives_all_rows(data: bytes) -> bool:
+    return not _decoding_error(data)
+
+
+def _decoding_error(data: bytes) -> str:
+    """Return what Pillow says of a JPEG that breaks off, with the number of bytes that wait for more; else nothing."""
     try:
         with Image.open(BytesIO(data), formats=("JPEG",)) as image:
             image.draft("L", (1, 1))  # the smallest that the decoder makes, for speed
             image.load()
-    except OSError:
-        return False
-    return True
+    except OSError as err:
+        return str(err)
+    return ""
 
 
 class UnreadableError(Exception):
