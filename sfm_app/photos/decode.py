@@ -20,7 +20,17 @@ import PIL
 from numpy.typing import NDArray
 from PIL import Image, ImageCms, UnidentifiedImageError, features
 from PIL.ExifTags import GPS, IFD, Base
-from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, PHOTOMETRIC_INTERPRETATION, ImageFileDirectory_v2
+from PIL.TiffImagePlugin import (
+    BITSPERSAMPLE,
+    COMPRESSION,
+    COMPRESSION_INFO,
+    IMAGELENGTH,
+    IMAGEWIDTH,
+    PHOTOMETRIC_INTERPRETATION,
+    SAMPLEFORMAT,
+    SAMPLESPERPIXEL,
+    ImageFileDirectory_v2,
+)
 
 from sfm_app.operating_system import find_in_wheel
 from sfm_app.photos.files import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
@@ -28,8 +38,22 @@ from sfm_app.types import CameraPrior, GpsPosition
 from sfm_app.types.arrays import BoolArray
 from sfm_app.types.photos import EXIF, SEA_LEVEL, TAKE_OFF
 
-FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
-"""Formats that every Pillow can read."""
+FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "PSD", "SGI", "PCX", "QOI", "TGA")
+"""Formats that every Pillow can read; the last one, without a mark of its own, is tried last."""
+WITH_LIBRARY = {"AVIF": "avif", "JPEG2000": "jpg_2000"}
+"""Formats that Pillow reads with a library, by the name of its feature."""
+UNREAD = {
+    "a JPEG XL photo": (b"\xff\x0a", b"\0\0\0\x0cJXL "),
+    "a JPEG XR photo": (b"II\xbc",),
+    "a JPEG 2000 photo": (b"\0\0\0\x0cjP", b"\xff\x4f\xff\x51"),
+    "an OpenEXR picture": (b"\x76\x2f\x31\x01",),
+    "a Radiance HDR picture": (b"#?RADIANCE", b"#?RGBE"),
+    "a floating-point picture in PFM": (b"PF\n",),
+    "a texture in DDS": (b"DDS ",),
+}
+"""First bytes of pictures that Pillow cannot read, or only with a library."""
+ICONS = (b"\0\0\1\0", b"\0\0\2\0\1", b"icns")
+SAVE_IT = "save it as JPEG or PNG"
 LOSSY = ("JPEG", "MPO", "WEBP", "HEIF", "AVIF")
 """Lossy formats: a copy as JPEG loses almost nothing more."""
 TIFF_HEADS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -311,14 +335,12 @@ def is_whole_jpeg(data: bytes) -> bool:
     """
     jpeg = _parse_jpeg(data)
     if jpeg.coding not in (0xC0, 0xC1, 0xC2):
-        return True
+        return jpeg.coding in (0, 0xC3)  # nothing shows the damage of others
     alone = jpeg.coding != 0xC2 and len(jpeg.scans) == 1
     return all(_is_whole_scan(data, jpeg, scan, _gives_all_rows if alone else _ends_scan) for scan in jpeg.scans)
 
 
-def _is_whole_scan(
-    data: bytes, jpeg: _Jpeg, scan: tuple[bytes, int, int], is_enough: Callable[[bytes], bool]
-) -> bool:
+def _is_whole_scan(data: bytes, jpeg: _Jpeg, scan: tuple[bytes, int, int], is_enough: Callable[[bytes], bool]) -> bool:
     colors, at, stop = scan
     if jpeg.interval:
         found = re.findall(rb"\xff([\xd0-\xd7])", data[at:stop])
@@ -365,7 +387,7 @@ class UnreadableError(Exception):
 @cache
 def formats() -> tuple[str, ...]:
     """Return the readable formats: HEIC needs the extra, AVIF a Pillow built with it."""
-    plain = FORMATS + (("AVIF",) if features.check("avif") else ())
+    plain = (*(name for name, library in WITH_LIBRARY.items() if features.check(library)), *FORMATS)
     try:
         importlib.import_module("pillow_heif").register_heif_opener()
     except ImportError:
@@ -403,7 +425,7 @@ def read_picture(path: Path) -> DecodedPhoto:
             with libtiff_errors() as errors:
                 image.load()
             if errors or (image.format in ("JPEG", "MPO") and not is_whole_jpeg(path.read_bytes())):
-                raise UnreadableError(DAMAGED)
+                raise UnreadableError(_unusual_coding(path) or DAMAGED)
             frames = frames or (1 if image.format == "MPO" else getattr(image, "n_frames", 1))  # MPO adds previews
             return apply_profile(DecodedPhoto(image, exif or _read_exif(image.getexif), frames))
     except UnidentifiedImageError:
@@ -417,7 +439,7 @@ def read_picture(path: Path) -> DecodedPhoto:
     except PermissionError:
         raise UnreadableError("not readable: permission denied") from None
     except Exception:  # decoders raise anything on damaged bytes
-        raise UnreadableError(DAMAGED) from None
+        raise UnreadableError(_unusual_coding(path) or DAMAGED) from None
 
 
 @contextmanager
@@ -442,6 +464,8 @@ def _find_picture(path: Path) -> tuple[Path | BytesIO | None, int]:
     """
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
+        if is_video(head):
+            raise UnreadableError(f"a video; run it alone: sfm-app run {printable_text(path.name)}")
         if head.startswith(RAW_HEADS) or head[4:12] == b"ftypcrx ":
             return None, 1
         if head[:4] not in TIFF_HEADS:
@@ -666,4 +690,47 @@ def _unreadable_reason(path: Path) -> str:
         return DAMAGED if "HEIF" in formats() else "HEIC photos need `pip install 'sfm-app[heic]'`"
     if head[4:8] == b"ftyp" and head[8:12] in AVIF_BRANDS:
         return DAMAGED if "AVIF" in formats() else "AVIF photos need a newer Pillow: `pip install -U pillow`"
-    return f"a video; run it alone: sfm-app run {printable_text(path.name)}" if is_video(head) else "not a photo"
+    if head.startswith(ICONS):
+        return "an icon"
+    named = next((f"{name}: {SAVE_IT}" for name, heads in UNREAD.items() if head.startswith(heads)), "")
+    return named or _unusual_coding(path) or "not a photo"
+
+
+def _unusual_coding(path: Path) -> str:
+    """Return the name of a JPEG or TIFF that its decoder does not know, and what to do; empty for others."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+            if head[:4] in TIFF_HEADS:
+                pictures = _list_tiff(file, head[: 16 if head[2:4] in (b"+\0", b"\0+") else 8])
+                what = _unusual_tiff(next(iter(pictures.values())))
+            elif head[:4] == b"8BPS":
+                what = "" if head[23] in (1, 8) else f"a Photoshop file of {head[23]} bits"
+            else:
+                what = _unusual_jpeg(_parse_jpeg(path.read_bytes())) if head[:2] == b"\xff\xd8" else ""
+    except Exception:  # damaged bytes raise anything
+        return ""
+    return f"{what}: {SAVE_IT}" if what else ""
+
+
+def _unusual_tiff(tags: ImageFileDirectory_v2) -> str:
+    """Return the name of a TIFF of a compression or of numbers that Pillow does not know; empty for others."""
+    compression, channels = tags.get(COMPRESSION, 1), tags.get(SAMPLESPERPIXEL, 1)
+    bits, kind = max(tags.get(BITSPERSAMPLE, (1,))), max(tags.get(SAMPLEFORMAT, (1,)))
+    if compression not in COMPRESSION_INFO:
+        return f"a TIFF of compression {compression}"
+    if channels <= 4 and bits <= (32 if channels == 1 else 16) and (kind != 3 or bits == 32):
+        return ""
+    numbers = "floating-point numbers" if kind == 3 else "numbers"
+    return f"a TIFF with {numbers} of {bits} bits, channels: {channels}"
+
+
+def _unusual_jpeg(jpeg: _Jpeg) -> str:
+    """Return the name of a JPEG that not all decoders know; empty for others."""
+    if jpeg.coding % 4 == 3:
+        return "a lossless JPEG"
+    if jpeg.coding > 0xC8:
+        return "a JPEG in arithmetic coding"
+    if jpeg.coding > 0xC4:
+        return "a hierarchical JPEG"
+    return f"a JPEG of {jpeg.frame[0]} bits" if jpeg.frame and jpeg.frame[0] == 12 else ""
