@@ -356,7 +356,7 @@ def _count_units(frame: bytes, colors: bytes) -> int:
     height, width = int.from_bytes(frame[1:3], "big"), int.from_bytes(frame[3:5], "big")
     factors = {frame[6 + 3 * k]: (frame[7 + 3 * k] >> 4, frame[7 + 3 * k] & 15) for k in range(frame[5])}
     own = factors[colors[0]] if len(colors) == 1 else (1, 1)
-    across, down = (8 * max(pair) for pair in zip(*factors.values(), strict=True))
+    across, down = 8 * max(h for h, _ in factors.values()), 8 * max(v for _, v in factors.values())
     return -(-width * own[0] // across) * -(-height * own[1] // down)
 
 
