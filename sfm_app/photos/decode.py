@@ -20,17 +20,7 @@ import PIL
 from numpy.typing import NDArray
 from PIL import Image, ImageCms, UnidentifiedImageError, features
 from PIL.ExifTags import GPS, IFD, Base
-from PIL.TiffImagePlugin import (
-    BITSPERSAMPLE,
-    COMPRESSION,
-    COMPRESSION_INFO,
-    IMAGELENGTH,
-    IMAGEWIDTH,
-    PHOTOMETRIC_INTERPRETATION,
-    SAMPLEFORMAT,
-    SAMPLESPERPIXEL,
-    ImageFileDirectory_v2,
-)
+from PIL.TiffImagePlugin import COMPRESSION_INFO, IMAGELENGTH, IMAGEWIDTH, ImageFileDirectory_v2
 
 from sfm_app.operating_system import find_in_wheel
 from sfm_app.photos.files import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
@@ -45,13 +35,12 @@ WITH_LIBRARY = {"AVIF": "avif", "JPEG2000": "jpg_2000"}
 UNREAD = {
     "a JPEG XL photo": (b"\xff\x0a", b"\0\0\0\x0cJXL "),
     "a JPEG XR photo": (b"II\xbc",),
-    "a JPEG 2000 photo": (b"\0\0\0\x0cjP", b"\xff\x4f\xff\x51"),
     "an OpenEXR picture": (b"\x76\x2f\x31\x01",),
     "a Radiance HDR picture": (b"#?RADIANCE", b"#?RGBE"),
     "a floating-point picture in PFM": (b"PF\n",),
     "a texture in DDS": (b"DDS ",),
 }
-"""First bytes of pictures that Pillow cannot read, or only with a library."""
+"""First bytes of pictures that Pillow cannot read."""
 ICONS = (b"\0\0\1\0", b"\0\0\2\0\1", b"icns")
 SAVE_IT = "save it as JPEG or PNG"
 LOSSY = ("JPEG", "MPO", "WEBP", "HEIF", "AVIF")
@@ -297,16 +286,15 @@ NEXT_MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
 
 @dataclass(slots=True)
 class _Jpeg:
-    """Parts of a JPEG; the first of several pictures."""
+    """Head with size and colors and its marker, units between two markers (0 without), and scans.
+
+    A scan has its colors, and where its data begin and end.
+    """
 
     frame: bytes = b""
-    """Head with the size and the colors."""
     coding: int = 0
-    """Marker of that head."""
     interval: int = 0
-    """Units between two markers; 0 without markers."""
     scans: list[tuple[bytes, int, int]] = field(default_factory=list)
-    """Colors of each scan, and where its data begin and end."""
 
 
 def _parse_jpeg(data: bytes) -> _Jpeg:
@@ -336,8 +324,8 @@ def is_whole_jpeg(data: bytes) -> bool:
     jpeg = _parse_jpeg(data)
     if jpeg.coding not in (0xC0, 0xC1, 0xC2):
         return jpeg.coding in (0, 0xC3)  # nothing shows the damage of others
-    alone = jpeg.coding != 0xC2 and len(jpeg.scans) == 1
-    return all(_is_whole_scan(data, jpeg, scan, _gives_all_rows if alone else _ends_scan) for scan in jpeg.scans)
+    is_enough = _ends_scan if jpeg.coding == 0xC2 or len(jpeg.scans) > 1 else lambda part: not _decoding_error(part)
+    return all(_is_whole_scan(data, jpeg, scan, is_enough) for scan in jpeg.scans)
 
 
 def _is_whole_scan(data: bytes, jpeg: _Jpeg, scan: tuple[bytes, int, int], is_enough: Callable[[bytes], bool]) -> bool:
@@ -363,10 +351,6 @@ def _count_units(frame: bytes, colors: bytes) -> int:
 def _ends_scan(data: bytes) -> bool:
     """Return whether the decoder is done with the last of several scans: it then skips all bytes, for a marker."""
     return all("(0 bytes" in _decoding_error(data + bytes(more)) for more in (0, 1))
-
-
-def _gives_all_rows(data: bytes) -> bool:
-    return not _decoding_error(data)
 
 
 def _decoding_error(data: bytes) -> str:
@@ -474,7 +458,7 @@ def _find_picture(path: Path) -> tuple[Path | BytesIO | None, int]:
             return None, 1
         start, length = (8, 8) if head[2:4] in (b"+\0", b"\0+") else (4, 4)  # BigTIFF has long addresses
         pictures = _list_tiff(file, head[: start + length])
-        if any(tags.get(PHOTOMETRIC_INTERPRETATION) in RAW_COLORS for tags in pictures.values()):
+        if any(tags.get(Base.PhotometricInterpretation) in RAW_COLORS for tags in pictures.values()):
             return None, 1
         whole = [place for place, tags in pictures.items() if not _is_preview(tags)] or [*pictures]
         sizes = [pictures[place].get(IMAGEWIDTH, 0) * pictures[place].get(IMAGELENGTH, 0) for place in whole]
@@ -715,8 +699,8 @@ def _unusual_coding(path: Path) -> str:
 
 def _unusual_tiff(tags: ImageFileDirectory_v2) -> str:
     """Return the name of a TIFF of a compression or of numbers that Pillow does not know; empty for others."""
-    compression, channels = tags.get(COMPRESSION, 1), tags.get(SAMPLESPERPIXEL, 1)
-    bits, kind = max(tags.get(BITSPERSAMPLE, (1,))), max(tags.get(SAMPLEFORMAT, (1,)))
+    compression, channels = tags.get(Base.Compression, 1), tags.get(Base.SamplesPerPixel, 1)
+    bits, kind = max(tags.get(Base.BitsPerSample, (1,))), max(tags.get(Base.SampleFormat, (1,)))
     if compression not in COMPRESSION_INFO:
         return f"a TIFF of compression {compression}"
     if channels <= 4 and bits <= (32 if channels == 1 else 16) and (kind != 3 or bits == 32):
