@@ -257,6 +257,7 @@ def view_run(
     out: PathLike,
     *,
     port: int = 0,
+    host: str = "",
     started: Callable[[str], None] | None = None,
     progress: Progress | Callback | None = None,
 ) -> None:
@@ -265,11 +266,12 @@ def view_run(
     Args:
         out: output folder of the run, which may have stopped at any stage.
         port: to listen on; 0 for any free port.
+        host: address to listen at, for other machines: the address of the page then has a token that it needs.
         started: called with the address when the page can be opened.
 
     Raises:
         InputError: the folder holds no run.
-        ConfigError: the port is taken.
+        ConfigError: the port is taken, or the host is no address of this machine.
 
     Examples:
         >>> import sfm_app
@@ -278,7 +280,7 @@ def view_run(
     from sfm_app.report.server import serve_run  # loads COLMAP
 
     with open_run(Path(out), Settings(), progress) as run:
-        serve_run(run, port, started or run.progress.say)
+        serve_run(run, port, started or run.progress.say, host)
 
 
 def export_model(

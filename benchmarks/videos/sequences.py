@@ -133,7 +133,7 @@ def map_sequence(sequence: Sequence, seed: int, folder: Path) -> tuple[pycolmap.
     """
     focal = FOCAL_PX * float(np.exp(np.random.default_rng(seed).normal(scale=0.01)))
     kind = pycolmap.CameraModelId.SIMPLE_RADIAL
-    params = [focal, SIZE[0] / 2, SIZE[1] / 2, sequence.drawn.camera.lens.k1]
+    params = [focal, SIZE[0] / 2, SIZE[1] / 2, sequence.drawn.camera.radial]
     start = pycolmap.Camera(camera_id=1, model=kind, width=SIZE[0], height=SIZE[1], params=params)
     database = folder / "database.db"
     model = write_model(sequence.drawn, start, database)

@@ -188,9 +188,14 @@ def demo(out: Path | None, scene: str, opens: bool | None, **flags: Any) -> None
 @click.command()
 @click.argument("out", type=PATH)
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port to listen on.  [default: a free one]")
+@click.option("--host", default="", help="Address to listen at for other machines (0.0.0.0: all), with a token.")
 @click.option("--no-browser", is_flag=True, help="Only print the address.")
-def view(out: Path, port: int, no_browser: bool) -> None:
-    """Show the run in OUT, with the model at full size, in the browser of this machine, until Ctrl-C."""
+def view(out: Path, port: int, host: str, no_browser: bool) -> None:
+    """Show the run in OUT, with the model at full size, in the browser of this machine, until Ctrl-C.
+
+    With --host, browsers of other machines can show it, too: whoever has the printed address, which contains a token.
+    From there, put the name of this machine in the place of 127.0.0.1.
+    """
     from sfm_app.cli.terminal import Terminal
 
     def announce(address: str) -> None:
@@ -201,7 +206,7 @@ def view(out: Path, port: int, no_browser: bool) -> None:
             open_browser(address)
 
     with Terminal(quiet=False) as progress:
-        sfm_app.view_run(out, port=port, started=announce, progress=progress)
+        sfm_app.view_run(out, port=port, host=host, started=announce, progress=progress)
 
 
 @click.command()

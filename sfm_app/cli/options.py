@@ -91,6 +91,8 @@ def settings_options(command: Command) -> Command:
         click.option("--config", type=PATH, help="Settings file (TOML); `sfm-app config` prints one."),
         *(setting_option(flag) for flag in SETTING_FLAGS),
         click.option("--no-plugins", is_flag=True, help=f"Do not {plugins}."),
+        # scripts for older versions pass it
+        click.option("--no-picture", is_flag=True, hidden=True, expose_value=False),
         click.option("--set", "assignments", multiple=True, metavar="TABLE.KEY=VALUE", help="Any other setting."),
         click.option(
             "-v",

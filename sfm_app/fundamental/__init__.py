@@ -19,10 +19,10 @@ gives the same bytes. docs/symbols.md has the symbols of the thesis and their na
 from collections.abc import Callable
 from functools import partial
 
-from sfm_app.fundamental.estimate import assess_fundamental, estimate_with
+from sfm_app.fundamental.estimate import assess_fundamental, estimate_with, fit_by_recipe
 from sfm_app.fundamental.lev_ransac import fit_lev_ransac
 from sfm_app.fundamental.points import check_points
-from sfm_app.fundamental.recipes import RECIPES, fit_by_name
+from sfm_app.fundamental.recipes import RECIPES
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 from sfm_app.types.arrays import FloatArray
@@ -31,7 +31,7 @@ FitFundamentalLike = Callable[[FloatArray, FloatArray, EpipolarSettings, int], E
 
 ESTIMATORS: dict[str, tuple[FitFundamentalLike, str]] = {
     "lev-ransac": (fit_lev_ransac, "samples guided by Cook's distances, local optimization, robust refit; the default"),
-    **{name: (partial(fit_by_name, name), about) for name, (_, about) in RECIPES.items()},
+    **{name: (partial(fit_by_recipe, recipe=recipe), about) for name, (recipe, about) in RECIPES.items()},
 }
 """By name: the estimator and one line about it."""
 

@@ -5,9 +5,8 @@ import math
 import numpy as np
 
 from sfm_app.fundamental.samples import SAMPLE_SIZE
-from sfm_app.fundamental.scores import squared_sampson_distance
+from sfm_app.fundamental.scores import squared_distances
 from sfm_app.fundamental.solvers import MOST_MODELS
-from sfm_app.jit import kernel
 from sfm_app.types.arrays import FloatArray
 
 MOST_FALSE_ALARMS = 1e-2
@@ -42,20 +41,9 @@ def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> f
 
 def squared_mismatch_distances(points: FloatArray, f: FloatArray) -> FloatArray:
     """Return (M,) squared Sampson distances of points of view 1 with the partners of other points; N >= 2."""
-    return _shifted_distances(points, f, min(len(points) - 1, max(1, 8000 // len(points))))
-
-
-@kernel
-def _shifted_distances(points: FloatArray, f: FloatArray, shifts: int) -> FloatArray:
-    count = points.shape[0]
-    wrong = np.empty(shifts * count)
-    for shift in range(shifts):
-        for i in range(count):
-            partner = (i + shift + 1) % count
-            wrong[shift * count + i] = squared_sampson_distance(
-                f, points[i, 0], points[i, 1], points[partner, 2], points[partner, 3]
-            )
-    return wrong
+    shifts = range(1, min(len(points) - 1, max(1, 8000 // len(points))) + 1)
+    partners = np.vstack([np.roll(points[:, 2:], -shift, axis=0) for shift in shifts])
+    return squared_distances(np.asfortranarray(np.hstack([np.tile(points[:, :2], (len(shifts), 1)), partners])), f)
 
 
 def accidental_share(wrong: FloatArray, threshold: float) -> float:

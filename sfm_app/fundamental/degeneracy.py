@@ -66,16 +66,14 @@ def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> 
     noise is proportional to 1 / |x2 x e2|, so each match has the weight |x2 x e2|^2.
     """
     U, _, _ = factorize(F)
-    e2, A = np.empty(3), np.empty((3, 3))
-    for i in range(3):
-        e2[i] = U[i, 2]
+    e2, A = U[:, 2].copy(), np.empty((3, 3))
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         for n in range(3):
             A[i, n] = e2[j] * F[k, n] - e2[k] * F[j, n]
     b, weights = _plane_equations(points, A, e2)
     best = _sample_plane(points, b, A, e2, 2.0 * threshold * threshold)
-    H = _homography(A, e2, best)
+    H = A - np.outer(e2, best)
     squared, on_plane = _squared_transfer_distances(points, H), 0
     for i in range(points.shape[0]):
         if squared[i] <= threshold * threshold:
@@ -83,16 +81,7 @@ def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> 
         else:
             weights[i] = 0.0
     if on_plane >= 3 and _fit_plane(points, b, weights, best):
-        H = _homography(A, e2, best)
-    return H
-
-
-@kernel
-def _homography(A: FloatArray, e2: FloatArray, v: FloatArray) -> FloatArray:
-    H = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            H[i, j] = A[i, j] - e2[i] * v[j]
+        H = A - np.outer(e2, best)
     return H
 
 
@@ -125,8 +114,7 @@ def _fit_plane(points: FloatArray, b: FloatArray, weights: FloatArray, plane: Fl
     decompose_symmetric(gram, values, vectors)
     if not values[0] > 1e-12 * values[2]:
         return False
-    for j in range(3):
-        plane[j] = 0.0
+    plane[:] = 0.0
     for n in range(3):
         projection = 0.0
         for j in range(3):
@@ -167,8 +155,7 @@ def _sample_plane(points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatArr
             on_plane += dx * dx + dy * dy <= limit * depth * depth
         if on_plane > most:
             most = on_plane
-            for k in range(3):
-                best[k] = v[k]
+            best[:] = v
     return best
 
 
@@ -331,13 +318,11 @@ def _draw_epipoles(  # noqa: PLR0913
             squared += f[c] * f[c]
         if not squared > 0.0:
             continue
-        for c in range(9):
-            f[c] /= np.sqrt(squared)
+        f /= np.sqrt(squared)
         score = penalty(points, FIRST, f, loss, lowest[0], pretest)
         if score < lowest[0]:
             lowest[0] = score
-            for c in range(9):
-                best[c] = f[c]
+            best[:] = f
             return trial
     return limit
 

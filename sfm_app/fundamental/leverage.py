@@ -35,16 +35,8 @@ def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArra
     # directions that no fitted match constrains, up to rounding: matches along them have leverage 1
     floor = max(values[-1], 2.0**-1000) * 1e-14
     forms = quadratic_forms(points, tangent @ (vectors / np.sqrt(np.maximum(values, floor))))
-    return _leverages_from_forms(forms, fitted)
-
-
-@kernel
-def _leverages_from_forms(forms: FloatArray, fitted: BoolArray) -> FloatArray:
-    """Return h of the fitted matches, g / (1 + g) of the others; g may be inf in unconstrained directions."""
-    leverage = np.empty(forms.shape[0])
-    for i in range(forms.shape[0]):
-        leverage[i] = min(forms[i], 1.0) if fitted[i] else 1.0 / (1.0 + 1.0 / forms[i])
-    return leverage
+    with np.errstate(divide="ignore"):  # a form may be 0, and inf in unconstrained directions
+        return np.where(fitted, np.minimum(forms, 1.0), 1.0 / (1.0 + 1.0 / forms))
 
 
 @kernel
@@ -81,11 +73,7 @@ def studentized_residuals(residuals: FloatArray, leverage: FloatArray, fitted: B
 @kernel
 def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
     """Return how far the fit would move without each match (thesis 3.16, 4.17, where the square of d_i is missing)."""
-    distances = np.empty(studentised.shape[0])
-    for i in range(studentised.shape[0]):
-        odds = leverage[i] / max(1.0 - leverage[i], _LEAST_FREEDOM)
-        distances[i] = studentised[i] * studentised[i] / PARAMETERS * odds
-    return distances
+    return studentised * studentised / PARAMETERS * (leverage / np.maximum(1.0 - leverage, _LEAST_FREEDOM))
 
 
 @kernel

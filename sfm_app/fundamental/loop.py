@@ -121,9 +121,7 @@ def draw_until_better(  # noqa: PLR0913
             start = int(uniform(state) * count) if pretest.random_start else 0
             score = penalty(points, start, models[k], loss, to_beat[kind], pretest)
             if score < to_beat[kind]:
-                to_beat[kind], better = score, True
-                for j in range(9):
-                    best[kind, j] = models[k, j]
+                to_beat[kind], best[kind], better = score, models[k], True
         if better and trial % draws.batch == 0:
             return trial
     return limit

@@ -11,15 +11,12 @@ from functools import partial
 
 import numpy as np
 
-from sfm_app.fundamental.estimate import fit_by_recipe
 from sfm_app.fundamental.leverage import prior_validity
 from sfm_app.fundamental.loop import Recipe
 from sfm_app.fundamental.pretests import RandomizedTdd, Sprt
 from sfm_app.fundamental.refits import refit_sampson
 from sfm_app.fundamental.scores import lmeds, mlesac, msac, msac_linear, ransac, residual_validity, squared_distances
 from sfm_app.numerical import MAD_TO_SIGMA
-from sfm_app.settings import EpipolarSettings
-from sfm_app.types import EpipolarFit, Rejected
 from sfm_app.types.arrays import FloatArray
 
 
@@ -65,10 +62,3 @@ RECIPES: Mapping[str, tuple[Recipe, str]] = {
 }
 """By name: recipe and one line about it. RES-RANSAC draws a tenth of its trials before it has priors (thesis 4.6.2);
 LMedS assumes half outliers (4.4.1)."""
-
-
-def fit_by_name(
-    name: str, x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int
-) -> EpipolarFit | Rejected:
-    """Run the estimator of a name in `RECIPES`, see `fit_by_recipe`; a `partial` of it can be pickled."""
-    return fit_by_recipe(x1, x2, options, seed, RECIPES[name][0])

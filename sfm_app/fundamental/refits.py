@@ -29,19 +29,15 @@ def factorize(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
     decompose_symmetric(gram, values, vectors)
     U, V = np.empty((3, 3)), np.empty((3, 3))
     for k in range(2):
-        for i in range(3):
-            V[i, k] = vectors[i, 2 - k]
+        V[:, k] = vectors[:, 2 - k]
         for i in range(3):
             U[i, k] = F[i, 0] * V[0, k] + F[i, 1] * V[1, k] + F[i, 2] * V[2, k]
     first = _normalize(U, FIRST)
     _orthogonalize(U)  # removes rounding errors, which matter where s is small
     second = _normalize(U, 1)
     if not second > 1e-12 * first:  # rank 1 but for rounding: any second column will do
-        least = 0
-        for i in range(1, 3):
-            least = i if abs(U[i, 0]) < abs(U[least, 0]) else least
-        for i in range(3):
-            U[i, 1] = 1.0 if i == least else 0.0
+        U[:, 1] = 0.0
+        U[np.argmin(np.abs(U[:, 0])), 1] = 1.0
         _orthogonalize(U)
         _normalize(U, 1)
     for i in range(3):  # the third columns, of singular value 0, make both matrices rotations
@@ -55,16 +51,14 @@ def factorize(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
 def _normalize(U: FloatArray, k: int) -> float:
     """Divide column k by its length; return the length."""
     length = np.sqrt(U[0, k] * U[0, k] + U[1, k] * U[1, k] + U[2, k] * U[2, k])
-    for i in range(3):
-        U[i, k] /= length
+    U[:, k] /= length
     return float(length)
 
 
 @kernel
 def _orthogonalize(U: FloatArray) -> None:
     dot = U[0, 0] * U[0, 1] + U[1, 0] * U[1, 1] + U[2, 0] * U[2, 1]
-    for i in range(3):
-        U[i, 1] -= dot * U[i, 0]
+    U[:, 1] -= dot * U[:, 0]
 
 
 @kernel
@@ -204,7 +198,7 @@ def _reweighted_least_squares(  # noqa: PLR0913
         _normal_equations(points, f, weights, U, s, V, gram, normal, right)
         improved = False
         while not improved and damping < 1e12:
-            if _solve(normal, right, damping, step):
+            if _solve_damped(normal, right, damping, step):
                 U_new, V_new, s_new = rotate(U, step[0:3]), rotate(V, step[3:6]), s + step[6]
                 new = compose(U_new, s_new, V_new)
                 fill_squared_distances(points, new, FIRST, trial)
@@ -267,11 +261,8 @@ def _normal_equations(  # noqa: PLR0913
     gram: FloatArray, normal: FloatArray, right: FloatArray,
 ) -> None:  # fmt: skip
     """Write the weighted J'J and -J'r of the seven parameters to `normal` and `right`."""
-    size = gram.shape[0]
-    for j in range(size):
-        for k in range(size):
-            gram[j, k] = 0.0
-    block, rows = np.empty((5, LANES)), np.empty((size, LANES))
+    gram[:] = 0.0
+    block, rows = np.empty((5, LANES)), np.empty((gram.shape[0], LANES))
     start = FIRST
     while start < points.shape[0]:
         count, start = gather(points, weights, start, block)
@@ -324,15 +315,19 @@ def _project(gram: FloatArray, basis: FloatArray, normal: FloatArray, right: Flo
 
 
 @kernel
-def _solve(normal: FloatArray, right: FloatArray, damping: float, step: FloatArray) -> bool:
-    """Write the Cholesky solution of (normal + damping diag(normal)) step = right; False if not positive definite."""
-    lower = normal.copy()
-    largest = 0.0
-    for j in range(7):
-        largest = max(largest, normal[j, j])
+def _solve_damped(normal: FloatArray, right: FloatArray, damping: float, step: FloatArray) -> bool:
+    """Write the solution of (normal + damping diag(normal)) step = right; False if not positive definite."""
+    lower, largest = normal.copy(), np.max(np.diag(normal))
     for j in range(7):
         lower[j, j] += damping * max(normal[j, j], 1e-9 * largest)  # matches may leave a direction of F free
-    for j in range(7):
+    return solve_cholesky(lower, right, step)
+
+
+@kernel
+def solve_cholesky(lower: FloatArray, right: FloatArray, step: FloatArray) -> bool:
+    """Write x of A x = right to `step` (n,); `lower` (n, n), A, is overwritten. False if A is not positive definite."""
+    size = right.shape[0]
+    for j in range(size):
         for k in range(j):
             for n in range(k):
                 lower[j, k] -= lower[j, n] * lower[k, n]
@@ -341,13 +336,13 @@ def _solve(normal: FloatArray, right: FloatArray, damping: float, step: FloatArr
         if not lower[j, j] > 0.0:
             return False
         lower[j, j] = np.sqrt(lower[j, j])
-    for j in range(7):
+    for j in range(size):
         step[j] = right[j]
         for k in range(j):
             step[j] -= lower[j, k] * step[k]
         step[j] /= lower[j, j]
-    for j in range(6, -1, -1):
-        for k in range(j + 1, 7):
+    for j in range(size - 1, -1, -1):
+        for k in range(j + 1, size):
             step[j] -= lower[k, j] * step[k]
         step[j] /= lower[j, j]
     return True

@@ -119,9 +119,7 @@ def quadratic_forms(points: FloatArray, whitening: FloatArray) -> FloatArray:
 def decompose_symmetric(matrix: FloatArray, values: FloatArray, vectors: FloatArray) -> None:
     """Write the ascending eigenvalues (n,) and the unit eigenvectors, one per column; overwrite `matrix`."""
     size = matrix.shape[0]
-    for i in range(size):
-        for j in range(size):
-            vectors[i, j] = 1.0 if i == j else 0.0
+    vectors[:] = np.eye(size)
     for _ in range(30):  # convergence is quadratic
         off, diagonal = 0.0, 0.0
         for i in range(size):
@@ -134,9 +132,9 @@ def decompose_symmetric(matrix: FloatArray, values: FloatArray, vectors: FloatAr
             for q in range(p + 1, size):
                 if matrix[p, q] != 0.0:
                     _rotate(matrix, vectors, p, q)
-    for i in range(size):
-        values[i] = matrix[i, i]
-    _sort(values, vectors)
+    order = np.argsort(np.diag(matrix))
+    values[:] = np.diag(matrix)[order]
+    vectors[:] = vectors[:, order]
 
 
 @kernel
@@ -155,19 +153,6 @@ def _rotate(matrix: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
         matrix[p, k], matrix[q, k] = c * a - s * b, s * a + c * b
         a, b = vectors[k, p], vectors[k, q]
         vectors[k, p], vectors[k, q] = c * a - s * b, s * a + c * b
-
-
-@kernel
-def _sort(values: FloatArray, vectors: FloatArray) -> None:
-    for i in range(values.shape[0] - 1):
-        least = i
-        for j in range(i + 1, values.shape[0]):
-            if values[j] < values[least]:
-                least = j
-        if least != i:
-            values[i], values[least] = values[least], values[i]
-            for k in range(values.shape[0]):
-                vectors[k, i], vectors[k, least] = vectors[k, least], vectors[k, i]
 
 
 # Fundamental matrices through seven or eight matches (thesis 4.3.1 and 4.4.2; Hartley and Zisserman, chapter 11).
@@ -229,8 +214,7 @@ def _solve_eighth_match(point: FloatArray, basis: FloatArray, model: FloatArray)
         for j in range(3):
             model[i + j] -= dot * v[j]
             squared += model[i + j] ** 2
-    for j in range(9):
-        model[j] /= np.sqrt(squared)
+    model /= np.sqrt(squared)
     return 1
 
 
@@ -333,9 +317,7 @@ def real_cubic_roots(c0: float, c1: float, c2: float, c3: float, roots: FloatArr
 @kernel
 def _null_space(points: FloatArray, sample: IndexArray, basis: FloatArray) -> bool:
     """Write two orthonormal vectors perpendicular to the first seven design rows; False if these are dependent."""
-    rows, place = np.empty((SAMPLE_SIZE, 9)), np.empty(9, dtype=np.int64)
-    for j in range(9):
-        place[j] = j
+    rows, place = np.empty((SAMPLE_SIZE, 9)), np.arange(9)
     for k in range(SAMPLE_SIZE):
         design_row(points[sample[k]], rows[k])
     largest = 0.0

@@ -129,7 +129,10 @@ class OverlapOptions:
     behind: float = 1.1
     """Points farther away than others in a cell, by this factor, may be hidden. Chosen by hand."""
     max_shared: float = 0.1
-    """Share of the expected cells up to which photos do not overlap. Chosen by hand."""
+    """Share of the expected cells up to which photos without matches do not overlap. Chosen by hand."""
+    below_usual: float = 0.5
+    """Photos do not overlap, either, if their share is lower than the median by this. Chosen by hand; right models of
+    real photos stay above the median less 0.3, photos of a symmetric object on its wrong side below it less 0.5."""
     pulling_share: float = 0.7
     """Share of the expected cells from which photos are on one side. Chosen by hand."""
     min_pairs: int = 10
@@ -283,10 +286,12 @@ def judge_places(models: Iterable[Attempt]) -> tuple[list[LookAlikes], int]:
 def find_non_overlapping(
     overlaps: Mapping[PairId, ExpectedOverlap], explained: Mapping[PairId, PairSupport]
 ) -> dict[PairId, ExpectedOverlap]:
-    """Return the pairs of photos that should overlap, and share next to nothing."""
+    """Return the pairs of photos that should overlap, and share next to nothing, or far less than other pairs do."""
+    usual = float(np.median([one.shared / one.expected for one in overlaps.values()])) if overlaps else 0.0
     return {
         pair: one for pair, one in overlaps.items()
-        if one.shared <= OVERLAPS.max_shared * one.expected and not _is_significant(explained.get(pair))
+        if one.shared < (usual - OVERLAPS.below_usual) * one.expected
+        or (one.shared <= OVERLAPS.max_shared * one.expected and not _is_significant(explained.get(pair)))
     }  # fmt: skip
 
 

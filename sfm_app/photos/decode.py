@@ -6,7 +6,7 @@ import re
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 from io import BytesIO
 from pathlib import Path
@@ -20,7 +20,7 @@ import PIL
 from numpy.typing import NDArray
 from PIL import Image, ImageCms, UnidentifiedImageError, features
 from PIL.ExifTags import GPS, IFD, Base
-from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, PHOTOMETRIC_INTERPRETATION, ImageFileDirectory_v2
+from PIL.TiffImagePlugin import COMPRESSION_INFO, IMAGELENGTH, IMAGEWIDTH, ImageFileDirectory_v2
 
 from sfm_app.operating_system import find_in_wheel
 from sfm_app.photos.files import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
@@ -28,8 +28,21 @@ from sfm_app.types import CameraPrior, GpsPosition
 from sfm_app.types.arrays import BoolArray
 from sfm_app.types.photos import EXIF, SEA_LEVEL, TAKE_OFF
 
-FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
-"""Formats that every Pillow can read."""
+FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "PSD", "SGI", "PCX", "QOI", "TGA")
+"""Formats that every Pillow can read; the last one, without a mark of its own, is tried last."""
+WITH_LIBRARY = {"AVIF": "avif", "JPEG2000": "jpg_2000"}
+"""Formats that Pillow reads with a library, by the name of its feature."""
+UNREAD = {
+    "a JPEG XL photo": (b"\xff\x0a", b"\0\0\0\x0cJXL "),
+    "a JPEG XR photo": (b"II\xbc",),
+    "an OpenEXR picture": (b"\x76\x2f\x31\x01",),
+    "a Radiance HDR picture": (b"#?RADIANCE", b"#?RGBE"),
+    "a floating-point picture in PFM": (b"PF\n",),
+    "a texture in DDS": (b"DDS ",),
+}
+"""First bytes of pictures that Pillow cannot read."""
+ICONS = (b"\0\0\1\0", b"\0\0\2\0\1", b"icns")
+SAVE_IT = "save it as JPEG or PNG"
 LOSSY = ("JPEG", "MPO", "WEBP", "HEIF", "AVIF")
 """Lossy formats: a copy as JPEG loses almost nothing more."""
 TIFF_HEADS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -261,63 +274,94 @@ def _install_handler() -> None:
 
 
 # libjpeg only warns of damaged data, which Pillow does not pass on: zeros or the data of another file are decoded to
-# the size of the photo, too. But then the data end before the last row, or go on after it.
+# the size of the photo, too. But then the data of a scan end before its last block, or go on after it.
 
 SPARE_BYTES = 64
 """Bytes that cameras may add after the last row; damage nearly always leaves more, or fewer than the rows need."""
-LOOK_AHEAD = bytes(16)
-"""The decoder reads so far ahead. The marker of the end would make it fill missing rows."""
+LOOK_AHEAD = b"\xff\0" * 8
+"""The decoder reads so far ahead. The marker of the end would make it fill missing rows; ones are no code."""
 NEXT_MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
 """End of the data of a scan: a marker that is neither a zero, which hides a byte of data, nor one of restarts."""
 
 
+@dataclass(slots=True)
+class _Jpeg:
+    """Head with size and colors and its marker, units between two markers (0 without), and scans.
+
+    A scan has its colors, and where its data begin and end.
+    """
+
+    frame: bytes = b""
+    coding: int = 0
+    interval: int = 0
+    scans: list[tuple[bytes, int, int]] = field(default_factory=list)
+
+
+def _parse_jpeg(data: bytes) -> _Jpeg:
+    jpeg, at = _Jpeg(), 0
+    while (found := NEXT_MARKER.search(data, at)) and (marker := data[found.end() - 1]) != 0xD9:
+        at = found.end()
+        if marker == 0xD8:  # the start, which has no length
+            continue
+        at, start = at + int.from_bytes(data[at : at + 2], "big"), at + 2
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and not jpeg.frame:  # no tables
+            jpeg.frame, jpeg.coding = data[start:at], marker
+        elif marker == 0xDD:
+            jpeg.interval = int.from_bytes(data[start:at], "big")
+        elif marker == 0xDA:
+            end = NEXT_MARKER.search(data, at)
+            stop = end.start() if end else len(data)
+            jpeg.scans.append((data[start + 1 : start + 1 + 2 * data[start] : 2], at, stop))
+            at = stop
+    return jpeg
+
+
 def is_whole_jpeg(data: bytes) -> bool:
-    """Return whether the data of a JPEG end with its last row; progressive ones, which have many scans, are not asked.
+    """Return whether the data of each scan of a JPEG end with its last block.
 
     Where markers divide the data into intervals, they must be complete.
     """
-    at, interval, frame = 2, 0, b""
-    while (marker := data[at + 1]) != 0xDA:  # start of the scan
-        if data[at] != 0xFF:
-            return True  # libjpeg goes over bytes between segments
-        if marker == 0xFF:  # fills a gap
-            at += 1
-            continue
-        length = int.from_bytes(data[at + 2 : at + 4], "big")
-        if marker in (0xC0, 0xC1):
-            frame = data[at + 4 : at + 2 + length]
-        if marker == 0xDD:
-            interval = int.from_bytes(data[at + 4 : at + 6], "big")
-        at += 2 + length
-    if not frame or data[at + 4] != frame[5]:  # progressive, or a scan for each color
-        return True
-    end = NEXT_MARKER.search(data, at + 2 + int.from_bytes(data[at + 2 : at + 4], "big"))
-    stop = end.start() if end else len(data)
-    if interval:
+    jpeg = _parse_jpeg(data)
+    if jpeg.coding not in (0xC0, 0xC1, 0xC2):
+        return jpeg.coding in (0, 0xC3)  # nothing shows the damage of others
+    is_enough = _ends_scan if jpeg.coding == 0xC2 or len(jpeg.scans) > 1 else lambda part: not _decoding_error(part)
+    return all(_is_whole_scan(data, jpeg, scan, is_enough) for scan in jpeg.scans)
+
+
+def _is_whole_scan(data: bytes, jpeg: _Jpeg, scan: tuple[bytes, int, int], is_enough: Callable[[bytes], bool]) -> bool:
+    colors, at, stop = scan
+    if jpeg.interval:
         found = re.findall(rb"\xff([\xd0-\xd7])", data[at:stop])
-        expected = (_count_units(frame) - 1) // interval
+        expected = (_count_units(jpeg.frame, colors) - 1) // jpeg.interval
         return found == [bytes([0xD0 + number % 8]) for number in range(expected)]
-    if not _gives_all_rows(data[:stop] + LOOK_AHEAD):
+    if not is_enough(data[:stop] + LOOK_AHEAD):
         return False
-    return stop - at <= 4 * SPARE_BYTES or not _gives_all_rows(data[: stop - SPARE_BYTES])
+    return stop - at <= 4 * SPARE_BYTES or not is_enough(data[: stop - SPARE_BYTES])
 
 
-def _count_units(frame: bytes) -> int:
-    """Return the number of units of a JPEG: squares of 8 pixels, or several where colors are coarser."""
+def _count_units(frame: bytes, colors: bytes) -> int:
+    """Return the number of units of a scan: squares of 8 pixels, or several where some of its colors are coarser."""
     height, width = int.from_bytes(frame[1:3], "big"), int.from_bytes(frame[3:5], "big")
-    factors = [(frame[7 + 3 * k] >> 4, frame[7 + 3 * k] & 15) for k in range(frame[5])]
-    across, down = (8 * max(pair) for pair in zip(*factors, strict=True)) if len(factors) > 1 else (8, 8)
-    return -(-width // across) * -(-height // down)
+    factors = {frame[6 + 3 * k]: (frame[7 + 3 * k] >> 4, frame[7 + 3 * k] & 15) for k in range(frame[5])}
+    own = factors[colors[0]] if len(colors) == 1 else (1, 1)
+    across, down = 8 * max(h for h, _ in factors.values()), 8 * max(v for _, v in factors.values())
+    return -(-width * own[0] // across) * -(-height * own[1] // down)
 
 
-def _gives_all_rows(data: bytes) -> bool:
+def _ends_scan(data: bytes) -> bool:
+    """Return whether the decoder is done with the last of several scans: it then skips all bytes, for a marker."""
+    return all("(0 bytes" in _decoding_error(data + bytes(more)) for more in (0, 1))
+
+
+def _decoding_error(data: bytes) -> str:
+    """Return what Pillow says of a JPEG that breaks off, with the number of bytes that wait for more; else nothing."""
     try:
         with Image.open(BytesIO(data), formats=("JPEG",)) as image:
             image.draft("L", (1, 1))  # the smallest that the decoder makes, for speed
             image.load()
-    except OSError:
-        return False
-    return True
+    except OSError as err:
+        return str(err)
+    return ""
 
 
 class UnreadableError(Exception):
@@ -327,7 +371,7 @@ class UnreadableError(Exception):
 @cache
 def formats() -> tuple[str, ...]:
     """Return the readable formats: HEIC needs the extra, AVIF a Pillow built with it."""
-    plain = FORMATS + (("AVIF",) if features.check("avif") else ())
+    plain = (*(name for name, library in WITH_LIBRARY.items() if features.check(library)), *FORMATS)
     try:
         importlib.import_module("pillow_heif").register_heif_opener()
     except ImportError:
@@ -365,7 +409,7 @@ def read_picture(path: Path) -> DecodedPhoto:
             with libtiff_errors() as errors:
                 image.load()
             if errors or (image.format in ("JPEG", "MPO") and not is_whole_jpeg(path.read_bytes())):
-                raise UnreadableError(DAMAGED)
+                raise UnreadableError(_unusual_coding(path) or DAMAGED)
             frames = frames or (1 if image.format == "MPO" else getattr(image, "n_frames", 1))  # MPO adds previews
             return apply_profile(DecodedPhoto(image, exif or _read_exif(image.getexif), frames))
     except UnidentifiedImageError:
@@ -379,7 +423,7 @@ def read_picture(path: Path) -> DecodedPhoto:
     except PermissionError:
         raise UnreadableError("not readable: permission denied") from None
     except Exception:  # decoders raise anything on damaged bytes
-        raise UnreadableError(DAMAGED) from None
+        raise UnreadableError(_unusual_coding(path) or DAMAGED) from None
 
 
 @contextmanager
@@ -404,6 +448,8 @@ def _find_picture(path: Path) -> tuple[Path | BytesIO | None, int]:
     """
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
+        if is_video(head):
+            raise UnreadableError(f"a video; run it alone: sfm-app run {printable_text(path.name)}")
         if head.startswith(RAW_HEADS) or head[4:12] == b"ftypcrx ":
             return None, 1
         if head[:4] not in TIFF_HEADS:
@@ -412,7 +458,7 @@ def _find_picture(path: Path) -> tuple[Path | BytesIO | None, int]:
             return None, 1
         start, length = (8, 8) if head[2:4] in (b"+\0", b"\0+") else (4, 4)  # BigTIFF has long addresses
         pictures = _list_tiff(file, head[: start + length])
-        if any(tags.get(PHOTOMETRIC_INTERPRETATION) in RAW_COLORS for tags in pictures.values()):
+        if any(tags.get(Base.PhotometricInterpretation) in RAW_COLORS for tags in pictures.values()):
             return None, 1
         whole = [place for place, tags in pictures.items() if not _is_preview(tags)] or [*pictures]
         sizes = [pictures[place].get(IMAGEWIDTH, 0) * pictures[place].get(IMAGELENGTH, 0) for place in whole]
@@ -628,4 +674,47 @@ def _unreadable_reason(path: Path) -> str:
         return DAMAGED if "HEIF" in formats() else "HEIC photos need `pip install 'sfm-app[heic]'`"
     if head[4:8] == b"ftyp" and head[8:12] in AVIF_BRANDS:
         return DAMAGED if "AVIF" in formats() else "AVIF photos need a newer Pillow: `pip install -U pillow`"
-    return f"a video; run it alone: sfm-app run {printable_text(path.name)}" if is_video(head) else "not a photo"
+    if head.startswith(ICONS):
+        return "an icon"
+    named = next((f"{name}: {SAVE_IT}" for name, heads in UNREAD.items() if head.startswith(heads)), "")
+    return named or _unusual_coding(path) or "not a photo"
+
+
+def _unusual_coding(path: Path) -> str:
+    """Return the name of a JPEG or TIFF that its decoder does not know, and what to do; empty for others."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+            if head[:4] in TIFF_HEADS:
+                pictures = _list_tiff(file, head[: 16 if head[2:4] in (b"+\0", b"\0+") else 8])
+                what = _unusual_tiff(next(iter(pictures.values())))
+            elif head[:4] == b"8BPS":
+                what = "" if head[23] in (1, 8) else f"a Photoshop file of {head[23]} bits"
+            else:
+                what = _unusual_jpeg(_parse_jpeg(path.read_bytes())) if head[:2] == b"\xff\xd8" else ""
+    except Exception:  # damaged bytes raise anything
+        return ""
+    return f"{what}: {SAVE_IT}" if what else ""
+
+
+def _unusual_tiff(tags: ImageFileDirectory_v2) -> str:
+    """Return the name of a TIFF of a compression or of numbers that Pillow does not know; empty for others."""
+    compression, channels = tags.get(Base.Compression, 1), tags.get(Base.SamplesPerPixel, 1)
+    bits, kind = max(tags.get(Base.BitsPerSample, (1,))), max(tags.get(Base.SampleFormat, (1,)))
+    if compression not in COMPRESSION_INFO:
+        return f"a TIFF of compression {compression}"
+    if channels <= 4 and bits <= (32 if channels == 1 else 16) and (kind != 3 or bits == 32):
+        return ""
+    numbers = "floating-point numbers" if kind == 3 else "numbers"
+    return f"a TIFF with {numbers} of {bits} bits, channels: {channels}"
+
+
+def _unusual_jpeg(jpeg: _Jpeg) -> str:
+    """Return the name of a JPEG that not all decoders know; empty for others."""
+    if jpeg.coding % 4 == 3:
+        return "a lossless JPEG"
+    if jpeg.coding > 0xC8:
+        return "a JPEG in arithmetic coding"
+    if jpeg.coding > 0xC4:
+        return "a hierarchical JPEG"
+    return f"a JPEG of {jpeg.frame[0]} bits" if jpeg.frame and jpeg.frame[0] == 12 else ""

@@ -160,7 +160,8 @@ def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> PhotoStats
         return UnusablePhoto(name, place)
     try:
         with large_photo_lock(place):
-            return describe(name, read_picture(place), options)
+            found = describe(name, read_picture(place), options)
+            return replace(found, file_bytes=place.stat().st_size) if isinstance(found, PhotoStats) else found
     except UnreadableError as err:
         return UnusablePhoto(name, str(err))
 

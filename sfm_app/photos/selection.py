@@ -72,6 +72,8 @@ class PhotoStats:
     """Share of their slope that edges keep after one more blur; near 1 if the photo is blurred."""
     flat: float = 0.0
     """Share of the picture in squares of one color."""
+    file_bytes: int = 0
+    """Size of its file: of two copies, the larger one lost less."""
 
 
 def measure_photo(photo: Photo, upright: Image.Image) -> PhotoStats:
@@ -114,7 +116,7 @@ def write_stats(
     """Write the statistics of the photos that have a digest; all keys are paths in the folder."""
     stats = {name: one for name, one in stats.items() if name in digests}
     rows = [
-        {"photo": one.photo.to_dict(), "blur": one.blur, "flat": one.flat, "digest": digests[name]}
+        {"photo": one.photo.to_dict(), "values": [one.blur, one.flat, one.file_bytes], "digest": digests[name]}
         for name, one in stats.items()
     ]
     # thumbnails have whole gray levels
@@ -133,7 +135,7 @@ def read_stats(path: Path, digests: Mapping[str, str], options: PhotoSettings) -
             return {}
         entries = zip(known["names"], known["rows"], arrays["thumbnails"].astype(np.float32), strict=True)
         return {
-            name: PhotoStats(Photo.from_dict(row["photo"]), thumbnail, row["blur"], row["flat"])
+            name: PhotoStats(Photo.from_dict(row["photo"]), thumbnail, *row["values"])
             for name, row, thumbnail in entries
             if digests.get(name) == row["digest"]
         }
@@ -153,11 +155,14 @@ def _fingerprint_reading(options: PhotoSettings) -> str:
 
 
 def drop_duplicates(stats: Sequence[PhotoStats]) -> tuple[list[Photo], list[UnusablePhoto]]:
-    """Return one photo per picture, and its copies, in the given order; photos with a mask, then large ones stay."""
+    """Return one photo per picture, and its copies, in the given order.
+
+    Photos with a mask stay, then those of more pixels, with EXIF, and of larger files.
+    """
     from scipy.spatial import cKDTree
 
     photos = [one.photo for one in stats]
-    order = sorted(range(len(photos)), key=lambda k: (not photos[k].mask, -photos[k].width * photos[k].height, k))
+    order = sorted(range(len(stats)), key=lambda k: (_worth(stats[k]), -k), reverse=True)
     small = np.array([one.thumbnail for one in stats], np.float32).reshape(len(stats), SIDE_PX**2)
     contrast = small.std(axis=1)
     originals: set[int] = set()
@@ -176,6 +181,12 @@ def drop_duplicates(stats: Sequence[PhotoStats]) -> tuple[list[Photo], list[Unus
         UnusablePhoto(photos[k].path, f"the same picture as {photos[original_of[k]].path}") for k in sorted(original_of)
     ]
     return [photos[k] for k in sorted(originals)], copies
+
+
+def _worth(one: PhotoStats) -> tuple[bool, int, bool, int]:
+    photo = one.photo
+    has_exif = bool(photo.group or photo.prior or photo.gps)
+    return bool(photo.mask), photo.width * photo.height, has_exif, one.file_bytes
 
 
 def drop_unusable(stats: Sequence[PhotoStats]) -> tuple[list[PhotoStats], list[UnusablePhoto]]:

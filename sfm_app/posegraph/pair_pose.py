@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sfm_app.camera.bearings import bearings
 from sfm_app.fundamental.degeneracy import DEGENERACY, dominant_homography, transfer_distance
+from sfm_app.fundamental.refits import solve_cholesky
 from sfm_app.geometry.epipolar import (
     FIRST,
     SECOND,
@@ -164,13 +165,15 @@ def _system(lines: FloatArray, pose: FloatArray, sigma: float) -> tuple[FloatArr
 
 @kernel
 def _descend(lines: FloatArray, pose: FloatArray, sigma: float, steps: int, gain: float) -> FloatArray:
-    cost, damping = _cost(lines, pose, sigma), DAMPING.first
+    cost, damping, step = _cost(lines, pose, sigma), DAMPING.first, np.empty(POSE_DOF)
     for _ in range(steps):
         A, b = _system(lines, pose, sigma)
         before, improved = cost, False
         while damping < DAMPING.most and not improved:
-            step = _solve(A, b, damping)
-            trial = retract(pose, step)
+            lifted = A.copy()
+            for j in range(POSE_DOF):
+                lifted[j, j] += damping * A[j, j] + 1e-9
+            trial = retract(pose, step) if solve_cholesky(lifted, b, step) else pose
             lower = _cost(lines, trial, sigma)
             if lower < cost:
                 pose, cost, improved = trial, lower, True
@@ -180,29 +183,6 @@ def _descend(lines: FloatArray, pose: FloatArray, sigma: float, steps: int, gain
         if not improved or before - cost < gain * before:
             break
     return pose
-
-
-@kernel
-def _solve(A: FloatArray, b: FloatArray, damping: float) -> FloatArray:
-    L, x = np.zeros((POSE_DOF, POSE_DOF)), np.empty(POSE_DOF)
-    for i in range(POSE_DOF):
-        for j in range(i + 1):
-            value = A[i, j]
-            if i == j:
-                value += damping * A[i, i] + 1e-9
-            for k in range(j):
-                value -= L[i, k] * L[j, k]
-            L[i, j] = np.sqrt(max(value, 1e-300)) if i == j else value / L[j, j]
-    for i in range(POSE_DOF):
-        x[i] = b[i]
-        for k in range(i):
-            x[i] -= L[i, k] * x[k]
-        x[i] /= L[i, i]
-    for i in range(POSE_DOF - 1, -1, -1):
-        for k in range(i + 1, POSE_DOF):
-            x[i] -= L[k, i] * x[k]
-        x[i] /= L[i, i]
-    return x
 
 
 Pose = tuple[FloatArray, FloatArray]

@@ -1,13 +1,17 @@
-"""`sfm-app view`: a server for the browsers of this machine."""
+"""`sfm-app view`: a server for the browsers of this machine, or for all who have its token."""
 
 import errno
+import hmac
+import io
 import logging
 import os
 import re
+import secrets
 import shlex
-import shutil
+import socket
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from email.utils import formatdate
 from functools import cached_property
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
@@ -15,6 +19,7 @@ from pathlib import Path
 from socketserver import ThreadingTCPServer
 from threading import Lock
 from typing import Any
+from urllib.parse import parse_qs
 
 import numpy as np
 
@@ -156,8 +161,9 @@ def read_resources(run: RunContext) -> RunResources:
     return resources
 
 
-# The server listens on the loopback address only. The name of an internet page can point there, too (DNS rebinding),
-# and its scripts would read the answers: so requests have to name the loopback address as their host.
+# The server listens on the loopback address. The name of an internet page can point there, too (DNS rebinding), and its
+# scripts would read the answers: so requests have to name the loopback address as their host. At another address, any
+# name may be right, and every request has to bring the token: first in its query, then in the cookie of the answer.
 
 LOOPBACK = "127.0.0.1"
 HEADERS = {
@@ -169,6 +175,18 @@ HEADERS = {
 }
 """Of every answer: no other page may embed or read it, and browsers do not keep it."""
 
+RANGE = re.compile(r"bytes=([0-9]{0,99})-([0-9]{0,99})", re.IGNORECASE)
+
+
+def asked_range(header: str, size: int) -> range | None:
+    """Return the bytes that a Range header asks for; empty outside the file, None without one well-formed range."""
+    first, last = found.groups() if (found := RANGE.fullmatch(header)) else ("", "")
+    if not first:
+        return range(max(0, size - int(last)), size) if last else None
+    if last and int(last) < int(first):
+        return None
+    return range(size)[int(first) : int(last) + 1 if last else size]
+
 
 class ViewServer(ThreadingTCPServer):
     """Serves the page of one run. An HTTPServer would ask the network for the name of this machine."""
@@ -176,9 +194,12 @@ class ViewServer(ThreadingTCPServer):
     daemon_threads = True
     allow_reuse_address = not lacks(Ability.REUSED_PORTS)
 
-    def __init__(self, resources: RunResources, port: int) -> None:
+    def __init__(self, resources: RunResources, port: int, host: str = "") -> None:
         self.resources = resources
-        super().__init__((LOOPBACK, port), ViewHandler)
+        self.host = host or LOOPBACK
+        self.token = secrets.token_urlsafe() if host else ""
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        super().__init__((self.host, port), ViewHandler)
 
     @property
     def port(self) -> int:
@@ -187,8 +208,15 @@ class ViewServer(ThreadingTCPServer):
 
     @property
     def address(self) -> str:
-        """Address of the page."""
-        return f"http://{LOOPBACK}:{self.port}/"
+        """Address of the page, with the token; that of this machine if it listens at all addresses."""
+        host = {"0.0.0.0": LOOPBACK, "::": "::1"}.get(str(self.server_address[0]), self.host)  # noqa: S104
+        name = f"[{host}]" if ":" in host else host
+        return f"http://{name}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+
+    @property
+    def cookie(self) -> str:
+        """Name and value of the cookie; browsers send the cookies of all ports of a machine."""
+        return f"sfm-app-{self.port}={self.token}"
 
     @property
     def hosts(self) -> tuple[str, ...]:
@@ -218,56 +246,85 @@ class ViewHandler(BaseHTTPRequestHandler):
         self._answer()
 
     def log_message(self, format: str, *values: Any) -> None:  # noqa: A002 - the name that the base class gives it
-        """Note a request in the log."""
-        logger.debug(format, *values)
+        """Note a request in the log, without its token."""
+        logger.debug("%s", re.sub(r"\?\S*", "", format % values))
 
     def _answer(self) -> None:
-        if self.headers.get_all("Host", []) not in [[host] for host in self.server.hosts]:
+        if self.server.token:
+            if not self._has_token():
+                self._refuse(HTTPStatus.FORBIDDEN, "Open the address that sfm-app view has printed, with its token.")
+                return
+        elif self.headers.get_all("Host", []) not in [[host] for host in self.server.hosts]:
             self._refuse(HTTPStatus.FORBIDDEN, "This page is only for the machine that serves it.")
             return
         resource = self.server.resources.find(self.path)
         if resource is None:
             self._refuse(HTTPStatus.NOT_FOUND, "There is nothing at this address.")
         else:
-            self._send(HTTPStatus.OK, resource)
+            cookie = {"Set-Cookie": f"{self.server.cookie}; Path=/; HttpOnly; SameSite=Strict"}
+            self._send(HTTPStatus.OK, resource, cookie if self.server.token else {})
+
+    def _has_token(self) -> bool:
+        queries = parse_qs(self.path.partition("?")[2]).get("token", [])
+        cookies = [part.strip() for part in self.headers.get("Cookie", "").split(";")]
+        pairs = [*((text, self.server.token) for text in queries), *((text, self.server.cookie) for text in cookies)]
+        return any(hmac.compare_digest(given.encode("utf-8"), known.encode("utf-8")) for given, known in pairs)
 
     def _refuse(self, status: HTTPStatus, text: str) -> None:
         self.close_connection = True
-        self._send(status, Resource("text/plain; charset=utf-8", text.encode("utf-8")))
+        self._send(status, Resource("text/plain; charset=utf-8", text.encode("utf-8")), {})
 
-    def _send(self, status: HTTPStatus, resource: Resource) -> None:
-        if isinstance(resource.content, Path):
-            with resource.content.open("rb") as file:
-                self._send_headers(status, resource.kind, os.fstat(file.fileno()).st_size)
-                if self.command != "HEAD":
-                    shutil.copyfileobj(file, self.wfile)
-            return
-        self._send_headers(status, resource.kind, len(resource.content))
-        if self.command != "HEAD":
-            self.wfile.write(resource.content)
+    def _send(self, status: HTTPStatus, resource: Resource, more: dict[str, str]) -> None:
+        content = resource.content
+        headers = {**HEADERS, **more, "Content-Type": resource.kind, "Accept-Ranges": "bytes"}
+        with content.open("rb") if isinstance(content, Path) else io.BytesIO(content) as file:
+            if isinstance(content, Path):
+                state = os.fstat(file.fileno())
+                headers["ETag"] = f'"{state.st_mtime_ns:x}-{state.st_size:x}"'
+                headers["Last-Modified"] = formatdate(state.st_mtime, usegmt=True)
+            size = file.seek(0, os.SEEK_END)
+            part = self._asked_range(size, headers) if status == HTTPStatus.OK else None
+            if part is not None:
+                status = HTTPStatus.PARTIAL_CONTENT if part else HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE
+                headers["Content-Range"] = f"bytes {f'{part.start}-{part.stop - 1}' if part else '*'}/{size}"
+            sent = range(size) if part is None else part
+            self.send_response(status)
+            for name, value in {**headers, "Content-Length": str(len(sent))}.items():
+                self.send_header(name, value)
+            self.end_headers()
+            if sent and self.command != "HEAD":
+                file.seek(sent.start)  # sendfile seeks to no offset of 0
+                self.connection.sendfile(file, sent.start, len(sent))
 
-    def _send_headers(self, status: HTTPStatus, kind: str, length: int) -> None:
-        self.send_response(status)
-        for name, value in {**HEADERS, "Content-Type": kind, "Content-Length": str(length)}.items():
-            self.send_header(name, value)
-        self.end_headers()
+    def _asked_range(self, size: int, headers: dict[str, str]) -> range | None:
+        """Return the bytes that the request asks for; None for all, as when the file is not that of If-Range."""
+        same = self.headers.get("If-Range") in (None, headers.get("ETag"), headers.get("Last-Modified"))
+        return asked_range(self.headers.get("Range", ""), size) if same and self.command == "GET" else None
 
 
-def open_server(resources: RunResources, port: int = 0) -> ViewServer:
-    """Start to listen, and return the server; port 0 is any free one, ConfigError for one that cannot be used."""
+def open_server(resources: RunResources, port: int = 0, host: str = "") -> ViewServer:
+    """Start to listen, and return the server; port 0 is any free one, ConfigError for one that cannot be used.
+
+    With a `host`, the server listens at this address, and requests need its token.
+    """
     try:
-        return ViewServer(resources, port)
-    except (OSError, OverflowError) as err:
-        reason = f"cannot be used: {err}"
+        return ViewServer(resources, port, host)
+    except (OSError, OverflowError, UnicodeError) as err:  # Unicode: a name with an empty part
+        reason, hint = f"port {port} cannot be used: {err}", "leave the port out for a free one"
         if isinstance(err, OSError) and err.errno in (errno.EADDRINUSE, errno.EACCES):
-            reason = f"is taken ({err.strerror})"
-        raise ConfigError(f"port {port} {reason}", hint="leave the port out for a free one") from err
+            reason = f"port {port} is taken ({err.strerror})"
+        elif not isinstance(err, OverflowError):
+            reason, hint = (
+                f"cannot listen at {host or LOOPBACK}: {err}",
+                "give an address of this machine, or 0.0.0.0 for all",
+            )
+        raise ConfigError(reason, hint=hint) from err
 
 
-def serve_run(run: RunContext, port: int, started: Callable[[str], None]) -> None:
+def serve_run(run: RunContext, port: int, started: Callable[[str], None], host: str = "") -> None:
     """Serve the page of a run until Ctrl-C; `started` is called with its address. Port 0 is any free one."""
     run.progress.say("preparing the page")
-    with open_server(read_resources(run), port) as server:
+    with open_server(read_resources(run), port, host) as server:
         try:
             started(server.address)
             server.serve_forever()

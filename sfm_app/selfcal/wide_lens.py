@@ -369,7 +369,7 @@ def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 
     selected, Fs = pairs.select(search)
     if len(Fs) < SEARCH.least_pairs:
         return None
-    refined = refine_lens(best, selected.with_matrices(Fs), pairs.threshold)
+    refined = refine_lens(best, list(zip(selected.matches, Fs, strict=True)), pairs.threshold)
     (log_focal, exponent, u, v), unit = refined.state.parameters, np.array([1.0, 1.0, side, side])
     radial = _fit_radial(best, 0.5 * float(np.hypot(*size)) / side)
     rival = RadialLens(radial[0], max(radial[1], SEARCH.least_radial)) if radial is not None else None
@@ -404,9 +404,6 @@ class _SampledPairs:
         rows = [k for k, (count, _) in enumerate(searches) if count >= SEARCH.least_support * len(self.matches[k])]
         matches, samples = tuple(self.matches[k] for k in rows), tuple(self.samples[k] for k in rows)
         return _SampledPairs(matches, samples, self.threshold), [searches[k][1] for k in rows]
-
-    def with_matrices(self, Fs: Sequence[FloatArray]) -> list[Pair]:
-        return list(zip(self.matches, Fs, strict=True))
 
     def support(self, searches: list[tuple[float, FloatArray]]) -> float:
         return sum(count for count, _ in searches) / float(sum(map(len, self.matches)))
@@ -452,7 +449,9 @@ def _first_look(
 def _log_odds(refined: RefinedLens, rival: RadialLens, pairs: _SampledPairs, Fs: Sequence[FloatArray]) -> float:
     """Return by how much less a lens costs than a rival, which starts twice, without the pair that gains most."""
     starts = Fs, [F for _, F in pairs.search(rival)]
-    rivals = (refine_lens(rival, pairs.with_matrices(start), pairs.threshold).state for start in starts)
+    rivals = (
+        refine_lens(rival, list(zip(pairs.matches, start, strict=True)), pairs.threshold).state for start in starts
+    )
     costs = min((pair_costs(pairs.matches, state, refined.sigma) for state in rivals), key=np.sum)
     gains = costs - pair_costs(pairs.matches, refined.state, refined.sigma)
     return float(np.sum(gains) - np.max(gains))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image, features
+from PIL import Image, ImageCms, features
 
 from sfm_app.api import open_run
 from sfm_app.photos.probe import read_photo
@@ -20,6 +20,7 @@ from sfm_app.photos.source import read_source
 from sfm_app.settings import PhotoSettings, Settings
 from sfm_app.stages import match_graph
 from sfm_app.stages import photos as photo_stage
+from tests.unit.photos.test_containers import dng
 
 from .mutations import ANYTHING, damaged, exif_block, jpeg_segments
 
@@ -30,7 +31,12 @@ PER_FORMAT = 100
 FORMATS = {
     "jpg": ("JPEG", {}), "progressive.jpg": ("JPEG", {"progressive": True}), "png": ("PNG", {}),
     "tif": ("TIFF", {"compression": "tiff_lzw"}), "raw.tif": ("TIFF", {}), "webp": ("WEBP", {}), "bmp": ("BMP", {}),
+    "jp2": ("JPEG2000", {}), "gif": ("GIF", {}), "tga": ("TGA", {"compression": "tga_rle"}), "sgi": ("SGI", {}),
+    "icc.jpg": ("JPEG", {"icc_profile": ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()}),
+    "dng": ("DNG", {}),
 }  # fmt: skip
+
+EXIF = ("JPEG", "PNG", "TIFF", "WEBP")
 
 
 def picture():
@@ -41,12 +47,14 @@ def picture():
 
 def saved(kind):
     name, options = FORMATS[kind]
+    if name == "DNG":
+        return dng()
     exif = Image.Exif()
     exif[0x0110], exif[0x0112] = "Box Brownie", 1
     exif.get_ifd(0x8769)[0xA405] = 28
     exif.get_ifd(0x8825)[2] = (51.0, 30.0, 0.0)
     buffer = io.BytesIO()
-    picture().save(buffer, name, **options, **({} if name == "BMP" else {"exif": exif}))
+    picture().save(buffer, name, **options, **({"exif": exif} if name in EXIF else {}))
     return buffer.getvalue()
 
 
@@ -121,6 +129,21 @@ def avif(width, height):
     return buffer.getvalue().replace(struct.pack(">II", 160, 120), struct.pack(">II", width, height))
 
 
+BILLION = 40_000, 25_000
+
+
+def patched(kind, old, new):
+    """A photo whose head claims another size, without a check sum that gives it away."""
+    buffer = io.BytesIO()
+    picture().save(buffer, kind)
+    data = buffer.getvalue()
+    assert old in data
+    data = data.replace(old, new)
+    if kind == "PNG":
+        data = data[:29] + struct.pack(">I", zlib.crc32(data[12:29])) + data[33:]
+    return data
+
+
 NUISANCES = {
     "pixels of one color": lambda: png(9_000, 6_000),
     "WebP of one color": lambda: webp(9_000, 6_000),
@@ -128,6 +151,18 @@ NUISANCES = {
     "a hundred megabytes of colors": lambda: png(80, 80, chunk(b"iCCP", b"x\0\0" + zlib.compress(bytes(10**8), 1))),
     "a hundred thousand pictures": lambda: tiff(100_000),
     "pictures in a ring": lambda: tiff(3, ring=True),
+    "PNG of a billion pixels": lambda: patched("PNG", struct.pack(">II", 160, 120), struct.pack(">II", *BILLION)),
+    "TIFF of a billion pixels": lambda: patched(
+        "TIFF",
+        struct.pack("<HHIIHHII", 256, 4, 1, 160, 257, 4, 1, 120),
+        struct.pack("<HHIIHHII", 256, 4, 1, BILLION[0], 257, 4, 1, BILLION[1]),
+    ),
+    "JPEG 2000 of a billion pixels": lambda: patched(
+        "JPEG2000", struct.pack(">II", 120, 160), struct.pack(">II", *BILLION)
+    ).replace(struct.pack(">II", 160, 120), struct.pack(">II", *BILLION)),
+    "WebP of the most pixels": lambda: patched(
+        "WEBP", (160 | 120 << 16).to_bytes(4, "little"), (16_383 | 16_383 << 16).to_bytes(4, "little")
+    ),
     "AVIF with a large head": lambda: avif(60_000, 60_000) if features.check("avif") else png(20_000, 9_000),
 }
 
@@ -148,6 +183,8 @@ def test_bombs_are_refused_or_cost_little(tmp_path):
         "a hundred megabytes of colors": "truncated or damaged",
         "a hundred thousand pictures": "",
         "pictures in a ring": "",
+        **dict.fromkeys((name for name in NUISANCES if name.endswith("billion pixels")), "too many pixels"),
+        "WebP of the most pixels": "too many pixels",
         "AVIF with a large head": "truncated or damaged" if features.check("avif") else "too many pixels",
     }
 

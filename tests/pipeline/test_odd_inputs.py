@@ -173,7 +173,7 @@ FILES = {
         "x.jpg",
         "a panorama of 180 x 180 degrees",
     ),
-    "GIF": (saved("x.gif"), "x.gif", "not a photo"),
+    "GIF": (saved("x.gif"), "x.gif", USED),
     "text": (written("x.txt", b"a text"), "x.txt", "not a photo"),
     "PDF": (written("x.pdf", b"%PDF-1.7\n"), "x.pdf", "not a photo"),
     "empty": (written("x.jpg", b""), "x.jpg", "empty"),

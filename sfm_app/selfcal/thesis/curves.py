@@ -8,7 +8,6 @@ complex roots.
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.jit import kernel
 from sfm_app.selfcal.pairs import Pairs
 from sfm_app.types.arrays import FloatArray
 
@@ -108,20 +107,7 @@ def _multiply(p: FloatArray, q: FloatArray) -> FloatArray:
     return product
 
 
-# All roots of many real polynomials (thesis 5.8.3): eigenvalues of companion matrices, followed along a sweep.
-
 ComplexArray = NDArray[np.complex128]
-
-_MOST_ROUNDS = 30
-"""Most rounds of Aberth's iteration for one sample; by hand."""
-_NUDGE = 1e-3
-"""Roots start off those of the sample before by this share of their size, each in another direction; by hand."""
-_ROUNDING = 1e-16
-"""Rounding error of a polynomial's value, as a share of the sizes of its terms: double precision."""
-_BLUR = 1e-10
-"""A root that rounding may shift by a larger share of its size counts as a multiple one; by hand."""
-_NO_STEP = 1e-15
-"""A step that no longer counts, as a share of the root's size: double precision, times ten."""
 
 
 def companion_roots(coefficients: FloatArray) -> ComplexArray:
@@ -129,100 +115,16 @@ def companion_roots(coefficients: FloatArray) -> ComplexArray:
 
     A polynomial of lower degree has roots far out in place of the missing ones; one that vanishes has all roots 0.
     """
-    monic = _make_monic(coefficients)
+    vanished = np.all(coefficients == 0, axis=-1, keepdims=True)
+    scaled = coefficients / np.where(vanished, 1.0, np.max(np.abs(coefficients), axis=-1, keepdims=True))
+    smallest, lead = np.finfo(np.float64).eps, scaled[..., -1:]
+    lead = np.where(np.abs(lead) < smallest, np.copysign(smallest, lead), lead)
     degree = coefficients.shape[-1] - 1
     companion = np.zeros((*coefficients.shape[:-1], degree, degree))
     companion[..., np.arange(1, degree), np.arange(degree - 1)] = 1.0
-    companion[..., :, -1] = -monic[..., :-1]
-    companion[np.all(coefficients == 0, axis=-1)] = 0.0
+    companion[..., :, -1] = -scaled[..., :-1] / lead
+    companion[vanished[..., 0]] = 0.0
     return np.linalg.eigvals(companion).astype(np.complex128)
-
-
-def swept_roots(coefficients: FloatArray) -> ComplexArray:
-    """Return `companion_roots` (P, S, n), in any order, of polynomials that change little from one S to the next.
-
-    It is far faster: Aberth's iteration (Math. Comp. 27, 1973) carries all roots of one polynomial to those of the
-    next. Eigenvalues are used where it does not converge, and for multiple roots, which it finds less accurately.
-    """
-    vanished = np.all(coefficients == 0, axis=-1)
-    first = np.argmin(vanished, axis=1)
-    roots = np.zeros((*vanished.shape, coefficients.shape[-1] - 1), dtype=np.complex128)
-    start = companion_roots(coefficients[np.arange(len(first)), first])
-    settled = _follow(_make_monic(coefficients), start, first, roots)
-    lost = ~(settled | vanished)
-    roots[vanished] = 0.0
-    roots[lost] = companion_roots(coefficients[lost])
-    return roots
-
-
-def _make_monic(coefficients: FloatArray) -> FloatArray:
-    """Divide by the leading coefficient; one that vanishes is replaced by the smallest that counts."""
-    size = np.max(np.abs(coefficients), axis=-1, keepdims=True)
-    scaled = coefficients / np.where(size == 0, 1.0, size)
-    smallest = np.finfo(np.float64).eps
-    lead = scaled[..., -1:]
-    scaled[..., -1:] = np.where(np.abs(lead) < smallest, np.copysign(smallest, lead), lead)
-    return np.asarray(scaled / scaled[..., -1:])
-
-
-@kernel
-def _follow(monic: FloatArray, start: ComplexArray, first: NDArray[np.int64], roots: ComplexArray) -> NDArray[np.bool_]:
-    """Fill `roots` from the `first` sample of each pair on, whose roots are `start`; return where they converged."""
-    count, samples, degree = roots.shape
-    settled = np.zeros((count, samples), dtype=np.bool_)
-    for i in range(count):
-        before = start[i]
-        for j in range(first[i], samples):
-            here = roots[i, j]
-            for k in range(degree):
-                # two roots that meet on the real axis leave it there; estimates on the axis never would
-                here[k] = before[k] * complex(1.0 + _NUDGE * np.cos(k), _NUDGE * np.sin(k))
-            settled[i, j] = _settle(monic[i, j], here)
-            if settled[i, j]:
-                before = here
-    return settled
-
-
-@kernel
-def _settle(monic: FloatArray, roots: ComplexArray) -> bool:
-    """Move estimates of all roots to the roots; return False where they do not converge or are multiple."""
-    degree = len(roots)
-    for _ in range(_MOST_ROUNDS):
-        moved = False
-        for i in range(degree):
-            z = roots[i]
-            size = abs(z)
-            value, slope, rounding = complex(monic[degree], 0.0), complex(0.0, 0.0), 1.0
-            for power in range(degree - 1, -1, -1):
-                slope = slope * z + value
-                value = value * z + monic[power]
-                rounding = rounding * size + abs(monic[power])
-            noise = _ROUNDING * rounding
-            if abs(value) <= noise:
-                if noise > _BLUR * abs(slope) * size:
-                    return False
-                continue
-            # Newton's step for the polynomial divided by the other roots' factors
-            repelled = complex(0.0, 0.0)
-            for j in range(degree):
-                if j != i:
-                    repelled += _inverse(z - roots[j])
-            step = value * _inverse(slope - value * repelled)
-            roots[i] = z - step
-            length = abs(step)
-            if not length < np.inf:
-                return False
-            moved = moved or length > _NO_STEP * size
-        if not moved:
-            return True
-    return False
-
-
-@kernel
-def _inverse(z: complex) -> complex:
-    """Return 1 / z; infinite or NaN at 0, without an exception."""
-    square = z.real * z.real + z.imag * z.imag
-    return complex(z.real / square, -z.imag / square)
 
 
 ROOT_IS_ZERO = 1e-9
@@ -238,7 +140,7 @@ def focal_curves(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> F
     """
     coefficients = focal_polynomials(pairs, fx, center)
     # the quartic is in fy^2: a negative fy^2 becomes an fy without real part, which the choice of the root skips
-    roots = np.sqrt(swept_roots(coefficients))
+    roots = np.sqrt(companion_roots(coefficients))
     # the imaginary part is to be "approximately zero": roots in which it prevails form tails near fy = 0 on which all
     # curves agree, whatever the camera
     return _select_roots(np.where(np.abs(roots.imag) <= np.abs(roots.real), roots, 0.0))
@@ -246,7 +148,7 @@ def focal_curves(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> F
 
 def center_curves(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
     """Return Z^oc of thesis (5.30): (P, S) v at every swept u (S,); as `focal_curves`."""
-    return _select_roots(swept_roots(center_polynomials(pairs, u, focal)))
+    return _select_roots(companion_roots(center_polynomials(pairs, u, focal)))
 
 
 def degeneracy(curves: FloatArray, upper: float) -> FloatArray:

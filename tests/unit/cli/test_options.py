@@ -84,7 +84,7 @@ def test_no_flag_changes_nothing():
 
 
 def test_run_has_every_flag():
-    shared = set(PARAMETERS) - {"photos", "out", "first", "last", "as_json", "quiet"}
+    shared = set(PARAMETERS) - {"photos", "out", "first", "last", "as_json", "quiet", "no_picture"}
     assert shared == {flag.parameter for flag in SETTING_FLAGS} | {"config", "no_plugins", "assignments", "verbose"}
 
 
@@ -128,3 +128,10 @@ def test_commands_choices_and_flags_are_completed(words, expected):
 def test_methods_and_formats_are_completed(words, kinds):
     assert completions(*words) == [name for kind in kinds for name in getattr(load_plugins(), kind)]
     assert completions(*words[:-1], "no-such") == []
+
+
+def test_scripts_for_older_versions_still_run(tmp_path, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(["run", str(tmp_path / "none"), "-o", str(tmp_path / "out"), "--no-picture"])
+    assert exit_.value.code == 3
+    assert "no such folder" in capsys.readouterr().err

@@ -8,11 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.synthetic.matches import make_two_motions
 from sfm_app.camera.bearings import bearings, project
+from sfm_app.fundamental.estimate import fit_by_recipe
 from sfm_app.fundamental.lev_ransac import fit_lev_ransac, search_patience
 from sfm_app.fundamental.loop import run_loop
 from sfm_app.fundamental.points import prepare
 from sfm_app.fundamental.rays import fit_lev_ransac_rays, validity
-from sfm_app.fundamental.recipes import RECIPES, fit_by_name, median_sigma
+from sfm_app.fundamental.recipes import RECIPES, median_sigma
 from sfm_app.geometry.epipolar import cross_matrix, decompose_essential, sampson_distance
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
@@ -51,7 +52,7 @@ def test_lmeds_draws_for_half_outliers_and_holds_up_to_there():
     assert (trials_of("lmeds", 0.1, range(2)) == expected).all()
     for seed in range(3):
         pair = make_pair(PairOptions(points=600, outliers=0.4), seed)
-        fit = fit_by_name("lmeds", pair.x1, pair.x2, OPTIONS, seed)
+        fit = fit_by_recipe(pair.x1, pair.x2, OPTIONS, seed, RECIPES["lmeds"][0])
         assert sampson_distance(fit.F, pair.exact_x1, pair.exact_x2).mean() < 0.4
 
 

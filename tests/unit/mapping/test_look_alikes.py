@@ -246,6 +246,24 @@ def test_photos_whose_matches_hold_are_no_strangers():
     assert set(found) == {(1, 3)}
 
 
+def wrong_side(usual, across):
+    """Overlaps of 20 photos, of which four stand on the wrong side of an object and have matches with all others."""
+    pairs = [(a, b) for a in range(20) for b in range(a + 1, 20)]
+    overlaps = {(a, b): ExpectedOverlap(50, across if a < 4 <= b else usual) for a, b in pairs}
+    explained = {(a, b): PairSupport(30 if a < 4 <= b else 200, 200, 0) for a, b in pairs}
+    return overlaps, explained
+
+
+def test_photos_on_the_wrong_side_of_a_symmetric_object_share_less_than_others():
+    (join,) = find_false_joins(*wrong_side(usual=48, across=15))
+    assert set(join.pairs) == {(a, b) for a in range(4) for b in range(4, 20)}
+    assert join.missing == pytest.approx(0.7)
+
+
+def test_where_all_photos_share_little_none_is_on_a_wrong_side():
+    assert find_false_joins(*wrong_side(usual=30, across=15)) == []
+
+
 @pytest.mark.slow
 def test_a_few_strangers_prove_nothing():
     pairs = [(a, a + 100) for a in range(OVERLAPS.min_pairs - 1)]

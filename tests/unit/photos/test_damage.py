@@ -65,6 +65,7 @@ PICTURES = {
 WAYS = {
     "plain": {}, "optimized": {"optimize": True}, "progressive": {"progressive": True}, "coarse": {"quality": 5},
     "gray": {"mode": "L"}, "CMYK": {"mode": "CMYK"}, "fine colors": {"subsampling": 0},
+    "progressive intervals": {"progressive": True, "restart_marker_blocks": 7},
     "intervals": {"restart_marker_blocks": 7}, "gray intervals": {"mode": "L", "restart_marker_blocks": 3},
     "two pictures": {"kind": "MPO", "save_all": True, "append_images": [Image.fromarray(scene(2))]},
 }  # fmt: skip
@@ -80,3 +81,39 @@ def test_bytes_that_cameras_add_and_a_missing_end_do_no_harm():
     assert is_whole_jpeg(WHOLE[:-2] + bytes(40) + b"\xff\xd9")
     assert is_whole_jpeg(WHOLE + bytes(5000))
     assert is_whole_jpeg(WHOLE[:2] + b"\xff\xff\xff" + WHOLE[2:])
+
+
+KINDS = {"baseline": {}, "progressive": {"progressive": True}, "baseline with intervals": {"restart_marker_blocks": 7}}
+DAMAGES = {"zeros": bytes, "noise": lambda count: np.random.default_rng(count).bytes(count), "cut off": lambda _: b""}
+
+
+def damaged_runs(kind, seeds=range(30)):
+    """Files of which a run was lost behind their head: zeros, noise, or an end in its place."""
+    whole = jpeg(scene(4), quality=90, **KINDS[kind])
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        at, count = int(rng.integers(len(whole) // 20, len(whole) - 600)), int(rng.integers(100, 5000))
+        name = [*DAMAGES][seed % 3]
+        rest = b"\xff\xd9" if name == "cut off" else whole[at + count :]
+        yield f"{name} at {at}", whole[:at] + DAMAGES[name](count) + rest
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_photos_are_left_out_or_hardly_differ(tmp_path, kind):
+    whole = np.asarray(Image.open(BytesIO(jpeg(scene(4), quality=90, **KINDS[kind]))), float)
+    left_out = 0
+    for name, data in damaged_runs(kind):
+        (tmp_path / "x.jpg").write_bytes(data)
+        try:
+            found = np.asarray(read_picture(tmp_path / "x.jpg").image, float)
+        except UnreadableError as err:
+            assert str(err) == "truncated or damaged", name
+            left_out += 1
+        else:
+            assert 10 * np.log10(255**2 / max(np.mean((found - whole) ** 2), 1e-9)) > 25, name
+    assert left_out > 20
+
+
+def test_a_progressive_photo_with_a_part_of_another_is_left_out():
+    fine, other = (jpeg(scene(seed), quality=90, progressive=True) for seed in (1, 2))
+    assert is_whole_jpeg(fine) and not is_whole_jpeg(fine[:AT] + other[AT:])

@@ -52,6 +52,20 @@ def test_the_largest_of_each_picture_stays(change):
     assert [(photo.name, photo.reason) for photo in copies] == [("copy.jpg", "the same picture as c")]
 
 
+def test_of_two_copies_more_pixels_then_exif_then_the_larger_file_stay(tmp_path):
+    exif = Image.Exif()
+    exif[0x0110] = "Box Brownie"
+    kinds = {"a_plain.jpg": {"quality": 95}, "b_coarse.jpg": {"quality": 60, "exif": exif},
+             "c_fine.jpg": {"quality": 95, "exif": exif}}  # fmt: skip
+    for name, options in kinds.items():
+        boxes().save(tmp_path / name, **options)
+    boxes().resize((640, 480), Image.Resampling.LANCZOS).save(tmp_path / "z_large.jpg", quality=60)
+    read = {name: read_photo(tmp_path, name, options=PhotoSettings()) for name in (*kinds, "z_large.jpg")}
+    for used in (["a_plain.jpg", "b_coarse.jpg"], ["b_coarse.jpg", "c_fine.jpg"], ["c_fine.jpg", "z_large.jpg"]):
+        kept, copies = drop_duplicates([read[name] for name in used])
+        assert (names(kept), names(copies)) == ([used[1]], [used[0]])
+
+
 @pytest.mark.parametrize("shift", [4, 10, 20])
 def test_a_step_to_the_side_and_another_exposure_are_other_photos(shift):
     dark = boxes().point(lambda gray: gray // 2)

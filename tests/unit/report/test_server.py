@@ -2,9 +2,11 @@
 
 import http.client
 import io
+import logging
 import os
 import signal
 import sys
+from contextlib import contextmanager
 from threading import Thread
 from types import SimpleNamespace
 
@@ -25,6 +27,7 @@ from sfm_app.report.server import (
     POINT_BYTES,
     SMALL_PX,
     RunResources,
+    asked_range,
     open_server,
     point_levels,
     serve_run,
@@ -32,6 +35,7 @@ from sfm_app.report.server import (
 from sfm_app.types import Model, Surface
 
 PAGE = b"<!DOCTYPE html><title>a page</title>"
+ALL = "0.0.0.0"  # noqa: S104 - behind a random token
 
 
 @pytest.fixture
@@ -126,15 +130,28 @@ def test_a_lighter_model_that_fails_has_no_address(resources):
     assert resources.find("/light.glb") is None
 
 
-@pytest.fixture
-def server(resources):
-    """A server that runs until the test ends."""
-    with open_server(resources) as found:
+@contextmanager
+def running(resources, host=""):
+    with open_server(resources, host=host) as found:
         thread = Thread(target=found.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
         yield found
         found.shutdown()
         thread.join()
+
+
+@pytest.fixture
+def server(resources):
+    """A server that runs until the test ends."""
+    with running(resources) as found:
+        yield found
+
+
+@pytest.fixture
+def public(resources):
+    """A server that listens at all addresses, until the test ends."""
+    with running(resources, ALL) as found:
+        yield found
 
 
 def ask(server, address="/", method="GET", **headers):
@@ -185,6 +202,103 @@ def test_two_hosts_in_one_request_are_refused(server):
 
 def test_nothing_can_be_sent_to_it(server):
     assert ask(server, "/", "POST")[0].status == 501
+
+
+def test_the_address_of_a_public_server_opens_the_page_and_sets_a_cookie_that_opens_the_rest(public, resources):
+    assert public.server_address[0] == ALL and len(public.token) >= 40
+    assert public.address == f"http://127.0.0.1:{public.port}/?token={public.token}"
+    answer, body = ask(public, f"/?token={public.token}", Host="a-machine.example")
+    assert (answer.status, body) == (200, resources.page)
+    cookie, *limits = answer.headers["Set-Cookie"].split("; ")
+    assert {"HttpOnly", "SameSite=Strict"} < set(limits)
+    assert ask(public, "/model.glb", Cookie=f"other=1; {cookie}", Host="a-machine.example")[1] == b"glTF" * 1000
+
+
+@pytest.mark.parametrize(
+    ("query", "cookie"),
+    [
+        ("", ""), ("?token=", ""), ("?token=wrong", ""), ("?token={token}x", ""), ("?x={token}", ""),
+        ("?token=%C3%A9é", ""), ("", "{name}="), ("", "{name}=wrong"), ("", "other={token}"), ("", "é"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("path", ["/", "/model.glb", "/nothing"])
+def test_without_its_token_a_public_server_refuses(public, path, query, cookie):
+    values = {"token": public.token, "name": f"sfm-app-{public.port}"}
+    connection = http.client.HTTPConnection(LOOPBACK, public.port, timeout=20)
+    request = (
+        f"GET {path}{query.format(**values)} HTTP/1.1\r\nHost: localhost\r\nCookie: {cookie.format(**values)}\r\n\r\n"
+    )
+    connection.connect()
+    connection.sock.sendall(request.encode("latin-1"))
+    with connection.sock.makefile("rb") as file:
+        answer = file.read()
+    connection.close()
+    assert answer.startswith(b"HTTP/1.1 403 ") and b"Set-Cookie" not in answer and b"token" in answer
+    assert public.token.encode() not in answer
+
+
+def test_each_public_server_has_its_own_token_and_the_log_has_none(public, resources, caplog):
+    with open_server(resources, host=LOOPBACK) as other:
+        assert other.token and other.token != public.token
+    with caplog.at_level(logging.DEBUG, "sfm_app"):
+        ask(public, f"/?token={public.token}")
+    assert "GET /" in caplog.text and public.token not in caplog.text
+
+
+def test_an_address_of_another_machine_is_an_error_that_says_so(resources):
+    with pytest.raises(ConfigError, match=r"cannot listen at 192\.0\.2\.1: ") as caught:
+        open_server(resources, host="192.0.2.1")
+    assert ALL in caught.value.hint
+    with pytest.raises(ConfigError, match=r"cannot listen at a\.\.b: "):
+        open_server(resources, host="a..b")
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        ("bytes=0-0", range(1)), ("bytes=4-", range(4, 10)), ("bytes=4-99", range(4, 10)), ("bytes=-3", range(7, 10)),
+        ("bytes=-99", range(10)), ("BYTES=2-3", range(2, 4)),
+        ("bytes=10-", range(0)), ("bytes=10-12", range(0)), ("bytes=-0", range(0)),
+        ("", None), ("bytes=-", None), ("bytes=5-4", None), ("bytes=0-1,3-4", None), ("bytes=a-b", None),
+        ("lines=0-1", None), ("bytes=+1-2", None), ("bytes=١-2", None), ("bytes=" + "9" * 5000 + "-", None),
+    ],
+)  # fmt: skip
+def test_a_range_is_clipped_to_ten_bytes_and_none_if_malformed(header, expected):
+    assert asked_range(header, 10) == expected
+
+
+@pytest.mark.parametrize("address", ["/model.glb", "/"])
+def test_a_part_of_a_resource_says_which_it_is(server, resources, address):
+    whole = ask(server, address)[1]
+    answer, body = ask(server, address, Range="bytes=5-8")
+    assert (answer.status, body, answer.headers["Content-Length"]) == (206, whole[5:9], "4")
+    assert answer.headers["Content-Range"] == f"bytes 5-8/{len(whole)}"
+    answer, body = ask(server, address, Range="bytes=-7")
+    assert (answer.status, body) == (206, whole[-7:])
+    answer, body = ask(server, address, Range=f"bytes={len(whole)}-")
+    assert (answer.status, body, answer.headers["Content-Range"]) == (416, b"", f"bytes */{len(whole)}")
+    for headers in ({}, {"Range": "bytes=8-5"}):
+        answer, body = ask(server, address, **headers)
+        assert (answer.status, body, answer.headers["Accept-Ranges"]) == (200, whole, "bytes")
+    assert ask(server, address, "HEAD", Range="bytes=5-8")[0].status == 200
+
+
+@pytest.mark.parametrize("name", ["ETag", "Last-Modified"])
+def test_a_part_of_a_file_that_has_changed_is_the_whole_new_file(server, resources, name):
+    known = ask(server, "/model.glb")[0].headers[name]
+    headers = {"Range": "bytes=0-3", "If-Range": known}
+    assert ask(server, "/model.glb", **headers)[0].status == 206
+    path = resources.find("/model.glb").content
+    path.write_bytes(b"new!" * 1000)
+    os.utime(path, (1_000_000_000, 1_000_000_000))
+    answer, body = ask(server, "/model.glb", **headers)
+    assert (answer.status, body) == (200, b"new!" * 1000)
+
+
+def test_an_empty_file_has_no_parts(server, resources):
+    resources.find("/model.glb").content.write_bytes(b"")
+    assert ask(server, "/model.glb")[0].status == 200
+    assert ask(server, "/model.glb", Range="bytes=-1")[0].status == 416
 
 
 def test_a_port_that_is_taken_is_an_error_that_says_so(server, resources):
