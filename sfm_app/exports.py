@@ -189,7 +189,7 @@ class StoredScene:
     def record_entries(self, file_format: str) -> dict[str, object]:
         """Return the entries of a folder's record; photos have the user's paths."""
         place = self._run.workspace
-        paths = {photo.name: photo.path for photo in read_photo_list(place).photos} if place.photo_set.exists() else {}
+        paths = {photo.name: photo.label for photo in read_photo_list(place).photos} if place.photo_set.exists() else {}
         return {
             "made_by": "sfm_app",
             "format": file_format,

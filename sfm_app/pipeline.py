@@ -1,25 +1,27 @@
 """The stages in order: the program's table of contents."""
 
-from collections.abc import Sequence
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from sfm_app import products
 from sfm_app.camera_files import read_given_cameras
 from sfm_app.colmap.dense import digest_maps
 from sfm_app.engine.execution import Pipeline
 from sfm_app.engine.stage import Products, Stage
-from sfm_app.errors import ConfigError
+from sfm_app.errors import ConfigError, InputError
 from sfm_app.frame.control_points import read_control_points
 from sfm_app.frame.positions import GEO_TXT, read_positions
 from sfm_app.frame.scale import MetricFrame
-from sfm_app.photos.gather import expand, gather, is_single
-from sfm_app.photos.source import read_source
+from sfm_app.photos.gather import expand, fill, find, is_single
+from sfm_app.photos.source import Source, read_source
 from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.stages import depth_maps, files, intrinsics, match_graph, mesh, photos, scale, scene, texture, view_graph
-from sfm_app.types import Intrinsics, MatchGraph, Model, PhotoSet, Scene, Surface, ViewGraph
+from sfm_app.types import GpsPosition, Intrinsics, MatchGraph, Model, PhotoSet, Scene, Surface, ViewGraph
 from sfm_app.wording import list_names
 
 PHOTOS: Stage[PhotoSet] = Stage(
@@ -130,24 +132,65 @@ def run_stages(
     inputs = expand(inputs)
     for path in inputs:
         place.check_no_overlap(path)
-    photo_dir = inputs[0] if is_single(inputs) else place.root / ".inputs"
-    if photo_dir not in inputs:
-        if options.images:
-            raise ConfigError("--images lists photos of one folder", hint="leave --images out")
-        gather(inputs, photo_dir, place.root)
     if options.masks:
         place.check_no_overlap(Path(options.masks), "masks")
     if run.settings.calibration.file:
         run = replace(run, given=read_given_cameras(Path(run.settings.calibration.file)))
-    source = read_source(photo_dir, place.root, options, partial(ordered_map, run.executor, ahead=4 * run.workers))
-    files = [name for name in source.files if name]
-    given = Path(options.positions) if options.positions else photo_dir / GEO_TXT
-    if options.positions or given.is_file():
-        positions, missing = read_positions(given, files)
+    with _open_source(inputs, run) as opened:
+        source, files = _with_positions(opened, run), [name for name in opened.files if name]
+        if run.settings.scale.control_points:
+            run = replace(run, control_points=read_control_points(Path(run.settings.scale.control_points), files))
+        return PIPELINE.run(source, run, first, last, targets)
+
+
+@contextmanager
+def _open_source(inputs: Sequence[Path], run: RunContext) -> Iterator[Source]:
+    """Provide the photos; several inputs are gathered in the output folder, which stays locked for the block."""
+    options, place = run.settings.photos, run.workspace
+    spread = partial(ordered_map, run.executor, ahead=4 * run.workers)
+    if is_single(inputs, place.root):
+        yield read_source(inputs[0], place.root, options, spread)
+        return
+    if options.images:
+        raise ConfigError("--images lists photos of one folder", hint="leave --images out")
+    found, is_new = find(inputs, place.root, options.masks), not place.root.exists()
+    place.create()
+    with place.hold_lock():
+        try:
+            fill(place.inputs, found, spread)
+            source = read_source(place.inputs, place.root, options, spread)
+        except InputError:
+            if is_new:  # a refused input leaves nothing behind
+                shutil.rmtree(place.root, ignore_errors=True)
+            raise
+        videos, beside = found.videos(place.inputs)
+        files = {name: digest for name, digest in source.files.items() if name not in beside}
+        left_out = {**source.left_out, **found.left_out, **beside}
+        yield replace(source, files=files, left_out=left_out, named=found.labels, videos=videos)
+
+
+def _with_positions(source: Source, run: RunContext) -> Source:
+    """Return the photos with the positions of the user's file, or of each geo.txt beside them, which is no photo."""
+    names = [name for name in source.files if source.named and PurePosixPath(name).name == GEO_TXT]
+    given = [(source.path / name, name.removesuffix(GEO_TXT)) for name in names or [GEO_TXT]]
+    if run.settings.photos.positions:
+        given = [(Path(run.settings.photos.positions), "")]
+    elif not all(path.is_file() for path, _ in given):
+        return source
+    known: dict[str, GpsPosition] = {}
+    for path, folder in given:
+        inside = [name.removeprefix(folder) for name in source.files if name and name.startswith(folder)]
+        place = source.named.get(f"{folder}{GEO_TXT}", str(path))
+        try:
+            positions, missing = read_positions(path, inside)
+        except InputError as err:
+            raise InputError(err.message.replace(str(path), place), hint=err.hint) from err
         if missing:
-            run.progress.say(f"{given} names photos that the folder does not have: {list_names(missing, 5)}")
-        others = [name for name in source.files if (photo_dir / name).resolve() != given.resolve()]
-        source = replace(source, files={name: source.files[name] for name in others}, positions=positions)
-    if run.settings.scale.control_points:
-        run = replace(run, control_points=read_control_points(Path(run.settings.scale.control_points), files))
-    return PIPELINE.run(source, run, first, last, targets)
+            run.progress.say(f"{place} names photos that the folder does not have: {list_names(missing, 5)}")
+        for name, position in positions.items():
+            if known.setdefault(folder + name, position) != position:
+                label = source.label(folder + name)
+                raise InputError(f"two geo.txt give {label} other positions", hint="name one file with --positions")
+    places = {path.resolve() for path, _ in given}
+    files = {name: digest for name, digest in source.files.items() if (source.path / name).resolve() not in places}
+    return replace(source, files=files, positions=known)

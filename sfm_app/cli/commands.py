@@ -82,7 +82,7 @@ def run(photos: tuple[Path, ...], out: Path | None, first: str | None, last: str
     seconds = monotonic() - start_s
     print_text(run_lines(result) if flags["verbose"] else outcome_lines(result, seconds))
     if not quiet and sys.stdout.isatty():
-        print_lines(run_steps(result, photos[0], out, settings))
+        print_lines(run_steps(result, photos, out, settings))
 
 
 def _default_folder(photos: Path) -> Path:

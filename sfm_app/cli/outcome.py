@@ -229,9 +229,9 @@ def _model_files(run: Run, stage: str) -> list[Path]:
     return [run.out / name for name in reversed(names) if (run.out / name).exists()]
 
 
-def run_steps(run: Run, photos: Path, out: Path | None, settings: Settings) -> list[str]:
+def run_steps(run: Run, photos: Sequence[Path], out: Path | None, settings: Settings) -> list[str]:
     """Return the next commands after a run; `photos` and `out` are as on the command line."""
-    again = f"sfm-app run {shlex.quote(str(photos))}" + (f" -o {shlex.quote(str(out))}" if out is not None else "")
+    again = f"sfm-app run {shlex.join(map(str, photos))}" + (f" -o {shlex.quote(str(out))}" if out is not None else "")
     if run.mesh_path is None:
         return _align_steps([(again, "continue to the model")])
     steps = [(_view_command(run), "view and measure it")]

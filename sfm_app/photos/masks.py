@@ -81,7 +81,7 @@ def check_mask(photo: Photo, folder: Path, masks: Path) -> Photo | UnusablePhoto
     """Return the photo, unusable if nothing of it is left; raise an InputError if its mask cannot be used."""
     if not photo.mask or usable_pixels(photo, folder, masks).any():
         return photo
-    return UnusablePhoto(photo.path, ALL_BLACK)
+    return UnusablePhoto(photo.label, ALL_BLACK)
 
 
 def unused_masks(names: Sequence[str], photos: Sequence[Photo]) -> list[str]:
@@ -144,7 +144,7 @@ def _load_opaque(photo: Photo, folder: Path) -> BoolArray:
     """Return the (H, W) opaque pixels of the laid-out photo."""
     source = resolve_file(folder, photo.path)
     if isinstance(source, str):
-        raise InputError(f"{photo.path} has changed while it was read: {source}")
+        raise InputError(f"{photo.label} has changed while it was read: {source}")
     picture = read_picture(source)
     opaque = undo_exif_orientation(Image.fromarray(opaque_pixels(picture.image)), orientation(picture.exif))
     upright = (photo.height, photo.width) if photo.turn_deg in (90, 270) else (photo.width, photo.height)

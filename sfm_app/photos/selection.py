@@ -178,7 +178,8 @@ def drop_duplicates(stats: Sequence[PhotoStats]) -> tuple[list[Photo], list[Unus
         else:
             originals.add(k)
     copies = [
-        UnusablePhoto(photos[k].path, f"the same picture as {photos[original_of[k]].path}") for k in sorted(original_of)
+        UnusablePhoto(photos[k].label, f"the same picture as {photos[original_of[k]].label}")
+        for k in sorted(original_of)
     ]
     return [photos[k] for k in sorted(originals)], copies
 
@@ -198,9 +199,9 @@ def drop_unusable(stats: Sequence[PhotoStats]) -> tuple[list[PhotoStats], list[U
     for one in stats:
         odd = sizes[_size_key(one.photo)] < OPTIONS.odd_size_share * len(stats)
         if one.blur > max(OPTIONS.blurred, median + OPTIONS.blurred_margin):
-            unusable.append(UnusablePhoto(one.photo.path, "blurred beyond use"))
+            unusable.append(UnusablePhoto(one.photo.label, "blurred beyond use"))
         elif photographic and one.flat >= OPTIONS.flat_share and odd:
-            unusable.append(UnusablePhoto(one.photo.path, "a screenshot or drawing, of another size"))
+            unusable.append(UnusablePhoto(one.photo.label, "a screenshot or drawing, of another size"))
         else:
             usable.append(one)
     return usable, unusable

@@ -46,13 +46,21 @@ class Source:
     """Sizes and times of the files, to detect later changes."""
     positions: Mapping[str, GpsPosition] = field(default_factory=dict)
     """By the user's file, by name of the photo."""
+    named: Mapping[str, str] = field(default_factory=dict)
+    """What the user calls each file where several inputs were gathered."""
+    videos: Sequence[str] = ()
+    """Names of the videos among gathered files."""
 
     @property
     def fingerprint(self) -> str:
-        """Hash of the path, the files and the masks."""
-        return fingerprint(
-            str(self.path.resolve()), self.files, self.left_out, self.masks, self.one_mask, self.positions
-        )
+        """Hash of the path, the files and the masks; gathered files move with the output folder."""
+        path = self.named or str(self.path.resolve())
+        return fingerprint(path, self.files, self.left_out, self.masks, self.one_mask, self.positions, self.videos)
+
+    def label(self, name: str) -> str:
+        """Return what the user calls a file, or a frame of a video."""
+        video, _, frame = name.rpartition("/")
+        return f"{self.named.get(video, video)}: {frame}" if video in self.videos else self.named.get(name, name)
 
     def content_hash(self, photos: PhotoSet) -> str:
         """Return a hash of the used photos and their masks, without camera groups, which do not affect features."""
@@ -65,8 +73,9 @@ class Source:
 
     def _content(self, photo: Photo) -> dict[str, Any]:
         """Return all values of a photo that results depend on."""
-        hashes = {"bytes": self.files.get(photo.path, self.files.get("")), "mask bytes": self.masks.get(photo.mask)}
-        return asdict(photo) | {"notes": ()} | hashes
+        video = photo.path.rpartition("/")[0]  # a folder of frames has the name of its video
+        digest = self.files.get(photo.path, self.files.get(video))
+        return asdict(photo) | {"notes": (), "named": "", "bytes": digest, "mask bytes": self.masks.get(photo.mask)}
 
     def digests(self) -> dict[str, str]:
         """Return the hashes of readable files by path in the folder; none for a video."""
@@ -74,13 +83,17 @@ class Source:
 
     def check(self, photos: PhotoSet) -> None:
         """Raise an InputError if the video, a photo or its mask has changed since the run began."""
-        used = {self.path} | {self.path / photo.path for photo in photos.photos}
+        used = {self.path} | {self.path / name for name in (*self.videos, *(photo.path for photo in photos.photos))}
         used |= {photos.masks / photo.mask for photo in photos.photos if photos.masks and photo.mask}
         for path in sorted(used & self.stamps.keys()):
             stamp = _stamp(path)
             if stamp != self.stamps[path]:
                 change = "is gone" if stamp is None else "has changed"
-                raise InputError(f"{path} {change} since the run began", hint="run again once the files are restored")
+                name = path.relative_to(self.path).as_posix() if path.is_relative_to(self.path) else ""
+                raise InputError(
+                    f"{self.named.get(name, path)} {change} since the run began",
+                    hint="run again once the files are restored",
+                )
 
 
 def read_source(path: Path, out: Path, options: PhotoSettings, spread: ParallelMap) -> Source:

@@ -294,7 +294,7 @@ def photo_rows(contents: RunContents, figures: ModelFigures | None, pictures: Ma
         measured = figures.photos.get(photo.name) if figures is not None else None
         rows.append(
             PhotoRow(
-                photo.path, state, "; ".join(filter(None, (reason, *photo.notes))),
+                photo.label, state, "; ".join(filter(None, (reason, *photo.notes))),
                 pairs.get(photo.name, 0) if contents.views is not None else None,
                 inliers.get(photo.name, 0) if contents.views is not None else None,
                 measured.points if measured else None,

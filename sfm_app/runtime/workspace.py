@@ -152,7 +152,8 @@ def _size(path: Path) -> int | None:
 
 
 DATABASE, CALIBRATION, SCENE, SCALE = "database.db", "calibration.json", "scene.json", "scale.json"
-OUTPUT_NAMES = (*RUN_FOLDERS, DATABASE, CALIBRATION, SCENE, SCALE)
+INPUTS = ".inputs"
+OUTPUT_NAMES = (*RUN_FOLDERS, DATABASE, CALIBRATION, SCENE, SCALE, INPUTS)
 """Files and folders that a run replaces."""
 HOLDER = ".held-by.txt"
 PARTS, FEATURES, MAPPING = "view_graph_parts", "feature_parts", ".mapping"
@@ -167,7 +168,9 @@ class Workspace:
     """One output folder."""
 
     def __init__(self, root: Path) -> None:
-        self.root, self.manifest = root, Manifest(root)
+        self.root, self.manifest, self._is_held = root, Manifest(root), False
+        self.inputs = root / INPUTS
+        """The files of several inputs."""
         self.photos = root / "photos"
         """Upright photos that COLMAP can read: links if it can read the file itself, else copies."""
         self.frames = root / "frames"
@@ -267,7 +270,13 @@ class Workspace:
 
     @contextlib.contextmanager
     def hold_lock(self) -> Iterator[None]:
-        """Hold the lock that keeps other runs out (InputError) until the block, or this process, ends."""
+        """Hold the lock that keeps other runs out (InputError) until the block, or this process, ends.
+
+        A block inside another one of the same object changes nothing.
+        """
+        if self._is_held:
+            yield
+            return
         holder = self.root / HOLDER
         lock = FileLock(self.root / LOCK, timeout=0)
         try:
@@ -282,8 +291,10 @@ class Workspace:
             holder.write_text(
                 f"process {os.getpid()} on {platform.node()} since {started}\n", encoding="utf-8", newline="\n"
             )
+            self._is_held = True
             yield
         finally:
+            self._is_held = False
             with contextlib.suppress(OSError):  # the folder may be gone or read-only, which the run reports
                 holder.unlink(missing_ok=True)
             self._release(lock)
@@ -311,7 +322,7 @@ class Workspace:
 
     def discard_unfinished(self) -> None:
         """Remove the markers of unfinished work, so that no run resumes it."""
-        markers = (self.root.glob(f"{folder}/{UNFINISHED}") for folder in ("*", "*/*"))
+        markers = (self.root.glob(f"{folder}/{UNFINISHED}") for folder in ("*", "*/*", f"{self.frames.name}/**"))
         for path in (self.database_marker, self.frames_marker, *chain(*markers)):
             path.unlink(missing_ok=True)
 

@@ -5,16 +5,16 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from sfm_app.errors import InputError
-from sfm_app.files import digest_files, replace_atomically
-from sfm_app.operating_system import is_link
+from sfm_app.files import UNFINISHED, digest_files, replace_atomically
+from sfm_app.operating_system import is_link, share_bytes
 from sfm_app.photos.decode import UnreadableError
-from sfm_app.photos.files import list_files
+from sfm_app.photos.files import list_files, resolve_file
 from sfm_app.photos.masks import MASK_HINT, assign_masks, check_mask, lay_out_mask, mask_path, unused_masks
 from sfm_app.photos.probe import group_by_camera, read_photo, split_by_given_camera, with_one_zero
 from sfm_app.photos.selection import PhotoStats, drop_duplicates, drop_unusable, read_stats, write_stats
@@ -46,29 +46,87 @@ class FrameChoice:
 
 
 @contextmanager
-def video_frames(source: Path, run: RunContext) -> Iterator[dict[str, float]]:
+def video_frames(source: Path, run: RunContext, name: str = "", most: int = 0) -> Iterator[dict[str, float]]:
     """Write the chosen frames of a video to OUT/frames, and provide their timestamps in seconds by file name.
 
-    If the run is killed before the block ends, the next one keeps the choice. Raise an InputError if the video cannot
-    be read or shows too little motion.
+    One of several videos has a folder of its `name` there, and `most` frames. If the run is killed before the block
+    ends, the next one keeps the choice. Raise an InputError if the video cannot be read or shows too little motion.
     """
-    choice = read_choice(run)
+    folder, marker = run.workspace.frames / name, _marker(run, name)
+    choice = read_choice(run, marker)
     if choice is None:
-        choice = choose_frames(source, run)
-        shutil.rmtree(run.workspace.frames, ignore_errors=True)
-        with replace_atomically(run.workspace.frames_marker) as path:
+        choice = choose_frames(source, run, most or run.settings.photos.max_frames)
+        shutil.rmtree(folder, ignore_errors=True)
+        with replace_atomically(marker) as path:
             path.write_text(json.dumps(asdict(choice)), encoding="utf-8", newline="\n")
-    _write_frames(source, choice.frames, run)
+    _write_frames(source, choice.frames, folder, run)
     run.record(video=choice.counts)
-    names = (frame_name(source, frame) for frame in choice.frames)
+    names = (f"{name}/{frame_name(source, frame)}".lstrip("/") for frame in choice.frames)
     yield dict(zip(names, choice.times_s, strict=True))
-    run.workspace.frames_marker.unlink()
+    marker.unlink()
 
 
-def read_choice(run: RunContext) -> FrameChoice | None:
+def _marker(run: RunContext, name: str) -> Path:
+    return run.workspace.frames / name / UNFINISHED if name else run.workspace.frames_marker
+
+
+@contextmanager
+def gathered_frames(source: Source, run: RunContext) -> Iterator[tuple[dict[str, float], list[UnusablePhoto]]]:
+    """Fill OUT/frames with the photos of several inputs and the frames of their videos, which are as in `video_frames`.
+
+    The videos share `max_frames` by their stated durations, or evenly where one states none. Also provide those that
+    cannot be used.
+    """
+    times_s, refused, counts = dict[str, float](), list[UnusablePhoto](), dict[str, Mapping[str, Any]]()
+    if not any(read_choice(run, _marker(run, name)) for name in source.videos):
+        shutil.rmtree(run.workspace.frames, ignore_errors=True)
+    with ExitStack() as opened:
+        for name, most in _share_frames(source, run.settings.photos.max_frames).items():
+            video = source.path / name
+            try:
+                times_s |= opened.enter_context(video_frames(video, run, name, most))
+                counts[source.label(name)] = run.statistics.pop("video")
+            except InputError as err:
+                reason = err.message.replace(str(video), "it")
+                refused.append(UnusablePhoto(source.label(name), reason))
+        for name in source.digests().keys() - set(source.videos):
+            place, file = run.workspace.frames / name, resolve_file(source.path, name)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.unlink(missing_ok=True)
+            if isinstance(file, Path):
+                share_bytes(file, place)
+        if counts:
+            run.record(video=_sum_counts(counts))
+        yield times_s, refused
+
+
+def _share_frames(source: Source, most: int) -> dict[str, int]:
+    """Return the most frames of each video: at least two."""
+    seconds = []
+    for name in source.videos:
+        try:
+            with open_video(source.path / name) as video:
+                seconds.append(video.claimed_s)
+        except UnreadableError:
+            seconds.append(0.0)
+    shares = seconds if all(seconds) else [1.0] * len(seconds)
+    return {name: max(2, int(most * one / sum(shares))) for name, one in zip(source.videos, shares, strict=True)}
+
+
+def _sum_counts(videos: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the figures of several videos as of one."""
+    left_out = Counter[str]()
+    for counts in videos.values():
+        left_out.update(counts["left_out"])
+    sums = {key: sum(counts[key] for counts in videos.values()) for key in ("frames", "seconds", "looked_at", "chosen")}
+    notes = [f"{label}: {note}" for label, counts in videos.items() for note in counts["notes"]]
+    return sums | {"left_out": dict(left_out), "notes": notes}
+
+
+def read_choice(run: RunContext, marker: Path) -> FrameChoice | None:
     """Return the choice of a killed run from the same inputs, or None."""
     try:
-        values = json.loads(run.workspace.frames_marker.read_text(encoding="utf-8"))
+        values = json.loads(marker.read_text(encoding="utf-8"))
         frames, times_s = tuple(map(int, values["frames"])), tuple(map(float, values["times_s"]))
         choice = FrameChoice(values["made_from"], frames, times_s, dict(values["counts"]))
     except (OSError, ValueError, TypeError, LookupError):
@@ -76,8 +134,8 @@ def read_choice(run: RunContext) -> FrameChoice | None:
     return choice if choice.made_from == run.fingerprint and len(times_s) == len(frames) else None
 
 
-def choose_frames(source: Path, run: RunContext) -> FrameChoice:
-    """Choose frames from the whole video."""
+def choose_frames(source: Path, run: RunContext, most: int) -> FrameChoice:
+    """Choose at most so many frames from the whole video."""
     try:
         with open_video(source) as video:
             tracker = CornerTracker()
@@ -95,7 +153,7 @@ def choose_frames(source: Path, run: RunContext) -> FrameChoice:
     if not tracked:
         limit = f"of at most {MOST_PIXELS // 10**6} megapixels"
         raise InputError(f"cannot read {source}: no frame of its {video.codec}, {limit}, can be decoded", hint=DAMAGED)
-    choice = select_keyframes(tracked, run.settings.photos.max_frames)
+    choice = select_keyframes(tracked, most)
     if len(choice.frames) < 2:
         problem = "the camera does not move" if tracker.has_texture else "there is too little texture to track"
         hint = "walk around while you film, slowly, and keep the object in view"
@@ -111,10 +169,10 @@ def choose_frames(source: Path, run: RunContext) -> FrameChoice:
     return FrameChoice(run.fingerprint, choice.frames, tuple(times_s[frame] for frame in choice.frames), counts)
 
 
-def _write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> None:
-    for incomplete in run.workspace.frames.glob(".*"):  # files of a killed run
+def _write_frames(source: Path, frames: tuple[int, ...], folder: Path, run: RunContext) -> None:
+    for incomplete in folder.glob(".*"):  # files of a killed run
         incomplete.unlink()
-    places = {frame: run.workspace.frames / frame_name(source, frame) for frame in frames}
+    places = {frame: folder / frame_name(source, frame) for frame in frames}
     missing = [frame for frame, place in places.items() if not place.exists()]
     if not missing:
         return
@@ -144,34 +202,43 @@ def frame_stem(source: Path) -> str:
 
 def make(source: Source, run: RunContext) -> PhotoSet:
     """Read a folder or a video, and lay the usable photos out for COLMAP; raise an InputError if too few are."""
+    folder = run.workspace.frames
+    if source.videos:
+        with gathered_frames(source, run) as (times_s, refused):
+            names = sorted([*(source.files.keys() - set(source.videos)), *times_s])
+            return _read_photos(source, folder, names, times_s, run, refused)
     if not source.video:
         return _read_photos(source, source.path, list(source.files), {}, run)
-    folder = run.workspace.frames
     with video_frames(source.path, run) as times_s:
         return _read_photos(source, folder, list_files(folder, run.workspace.root), times_s, run)
 
 
 def load(source: Source, run: RunContext) -> PhotoSet:
     """Read photos.json back; laid-out photos that are missing or damaged are laid out again."""
-    return _read_photo_set(run.workspace.frames if source.video else source.path, source.mask_dir, run)
+    return _read_photo_set(run.workspace.frames if source.video or source.videos else source.path, source.mask_dir, run)
 
 
 def _read_photos(
-    source: Source, folder: Path, names: Sequence[str], times_s: Mapping[str, float], run: RunContext
-) -> PhotoSet:
+    source: Source, folder: Path, names: Sequence[str], times_s: Mapping[str, float], run: RunContext,
+    refused: Sequence[UnusablePhoto] = (),
+) -> PhotoSet:  # fmt: skip
     options = run.settings.photos
     if run.settings.max_memory_gb:
         largest = min(options.max_megapixels, largest_photo_megapixels(run.memory_mb))
         options = options.model_copy(update={"max_megapixels": largest})
     contents = read_all(source, folder, names, options, run)
-    unreadable = [UnusablePhoto(name, reason) for name, reason in source.left_out.items()]
-    unreadable += [photo for photo in contents if isinstance(photo, UnusablePhoto)]
-    stats, masked = attach_masks([one for one in contents if isinstance(one, PhotoStats)], folder, source, run)
+    unreadable = [UnusablePhoto(source.label(name), reason) for name, reason in source.left_out.items()]
+    bad = [photo for photo in contents if isinstance(photo, UnusablePhoto)]
+    unreadable += [*refused, *(replace(photo, name=source.label(photo.name)) for photo in bad)]
+    good = [one for one in contents if isinstance(one, PhotoStats)]
+    if source.named:
+        good = [replace(one, photo=_as_gathered(one.photo, source)) for one in good]
+    stats, masked = attach_masks(good, folder, source, run)
     photos, useless = select_photos(stats, keep_low_quality=options.keep_low_quality)
     unusable = sorted(unreadable + masked + useless, key=lambda photo: photo.name)
     if len(photos) < 2:
         raise InputError(
-            _too_few_message(folder, len(photos), unusable),
+            _too_few_message("the inputs" if source.named else str(folder), len(photos), unusable),
             hint="at least two photos of a place are needed; 10 to 50 work best",
             photos={photo.name: photo.reason for photo in unusable},
         )
@@ -189,7 +256,7 @@ def _read_photos(
     copies = {photo.name: _copy_digest(photo, run) for photo in photo_set.photos}
     write_photo_list(photo_set, copies, run.workspace)
     run.record(usable=len(photos), cameras=len(photo_set.groups), unusable={p.name: p.reason for p in unusable})
-    run.record(notes={photo.path: list(photo.notes) for photo in photos if photo.notes})
+    run.record(notes={photo.label: list(photo.notes) for photo in photos if photo.notes})
     run.record(gps=sum(photo.gps is not None for photo in timed))
     return photo_set
 
@@ -234,9 +301,16 @@ def attach_masks(
     return used, [photo for photo in photos if isinstance(photo, UnusablePhoto)]
 
 
+def _as_gathered(photo: Photo, source: Source) -> Photo:
+    """Return the photo with the user's name; the frames of each video are a camera of their own."""
+    video = photo.path.rpartition("/")[0]
+    group = " ".join(filter(None, (photo.group, video))) if video in source.videos else photo.group
+    return replace(photo, named=source.label(photo.path), group=group)
+
+
 def _mask_counts(photos: Sequence[Photo], hiding: Sequence[bool], names: list[str]) -> dict[str, Any]:
     """Return the manifest's entry: photos with a mask, those whose mask hides nothing, and files that are no mask."""
-    white = [photo.path for photo, hides in zip(photos, hiding, strict=True) if photo.mask and not hides]
+    white = [photo.label for photo, hides in zip(photos, hiding, strict=True) if photo.mask and not hides]
     masked = sum(bool(photo.mask or photo.cut_out) for photo in photos)
     return {"photos": masked, "unused": unused_masks(names, photos)} | ({"white": white} if white else {})
 
@@ -247,7 +321,7 @@ def lay_out_photo(photo: Photo, *, folder: Path, target: Path) -> None:
         lay_out(photo, folder, target)
     except UnreadableError as err:
         raise InputError(
-            f"{photo.path} has changed while it was read: {err}", hint="run again once its files are restored"
+            f"{photo.label} has changed while it was read: {err}", hint="run again once its files are restored"
         ) from err
 
 
@@ -272,7 +346,7 @@ def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoS
     return photo_set
 
 
-def _too_few_message(folder: Path, usable: int, unusable: list[UnusablePhoto]) -> str:
+def _too_few_message(folder: str, usable: int, unusable: list[UnusablePhoto]) -> str:
     reasons = Counter("copies of another" if "same picture" in photo.reason else photo.reason for photo in unusable)
     missing = [photo.name for photo in unusable if photo.reason == "missing"]  # from a list
     counts = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())

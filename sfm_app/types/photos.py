@@ -133,11 +133,18 @@ class Photo:
     """Seconds from the start of its video; None for photos."""
     cut_out: bool = False
     """True where pixels of the file are transparent, which masks them."""
+    named: str = ""
+    """What the user calls it where several inputs were gathered: `pack.zip: a/b.jpg`."""
 
     @property
     def path(self) -> str:
         """Path inside the folder."""
         return self.original or self.name
+
+    @property
+    def label(self) -> str:
+        """Name for people."""
+        return self.named or self.path
 
     def to_dict(self) -> dict[str, Any]:
         """Return the photo as JSON values."""

@@ -253,26 +253,26 @@ MODEL = Run(OUT, None, None, None, OUT / "model.glb", {})
 
 
 def test_next_commands_can_be_copied():
-    lines = run_steps(MODEL, PHOTOS, None, Settings())
+    lines = run_steps(MODEL, [PHOTOS], None, Settings())
     assert lines[0].startswith("next        sfm-app view out")
     assert lines[1].startswith("            sfm-app run 'my photos' --quality high")
     assert lines[2].startswith("            sfm-app export out --format obj")
     assert len(lines) == 3 and max(map(len, lines)) <= 80 and len({line.rindex("  ") for line in lines}) == 1
-    assert "sfm-app run 'my photos' -o out --quality high" in "\n".join(run_steps(MODEL, PHOTOS, OUT, Settings()))
+    assert "sfm-app run 'my photos' -o out --quality high" in "\n".join(run_steps(MODEL, [PHOTOS], OUT, Settings()))
     assert {"--quality", "-o"} <= {flag for parameter in commands.run.params for flag in parameter.opts}
 
 
 def test_long_commands_have_their_purpose_below():
-    lines = run_steps(MODEL, Path("a" * 60), None, Settings())
+    lines = run_steps(MODEL, [Path("a" * 60)], None, Settings())
     assert len(lines) == 6 and all(line.startswith("              ") for line in lines[1::2])
     assert not any(line.startswith("              ") for line in lines[::2])
 
 
 def test_the_next_commands_depend_on_the_run():
     best = Settings.from_mapping({"quality": "high", "scale": {"markers": "50mm"}})
-    assert not any("finer" in line for line in run_steps(MODEL, PHOTOS, None, best))
+    assert not any("finer" in line for line in run_steps(MODEL, [PHOTOS], None, best))
     stopped = Run(OUT, None, None, None, None, {})
-    assert ["continue to the model" in line for line in run_steps(stopped, PHOTOS, None, best)] == [True]
+    assert ["continue to the model" in line for line in run_steps(stopped, [PHOTOS], None, best)] == [True]
 
 
 @pytest.mark.parametrize(("scene", "other"), [("courtyard", "statue"), ("statue", "fisheye")])
