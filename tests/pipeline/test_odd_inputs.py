@@ -2,6 +2,7 @@
 
 import json
 import os
+import zipfile
 import zlib
 from pathlib import Path
 
@@ -272,6 +273,21 @@ COMMANDS = {
     "an encrypted video": ("{videos}/closed.mp4 -o {here}/out", 3, "encrypted"),
     "sound without a video": ("{videos}/sound.avi -o {here}/out", 3, "sound, but no video in this AVI"),
     "a camera that does not move": ("{videos}/still.avi -o {here}/out", 3, "the camera does not move"),
+    "several inputs without an output folder": ("{photos} {photos}/a.jpg", 2, "no folder for the results"),
+    "a wildcard without a file": ("{here}/none*.jpg -o {here}/out", 3, "no such folder"),
+    "a missing photo among others": ("{photos}/a.jpg {here}/none.jpg -o {here}/out", 3, "no such file or folder"),
+    "a list of photos with several inputs":
+        ("{photos} {photos}/a.jpg -o {here}/out --images {here}/list.txt", 2, "--images"),
+    "an input as masks": ("{photos} {photos}/a.jpg -o {here}/out --masks {photos}", 3, "photos and masks"),
+    "one photo and a list": ("{photos}/a.jpg {here}/list.txt -o {here}/out", 3, "one usable photo in the inputs"),
+    "an empty ZIP": ("{archives}/empty.zip -o {here}/out", 3, "empty.zip holds no file"),
+    "an encrypted ZIP": ("{archives}/closed.zip -o {here}/out", 3, "closed.zip is encrypted"),
+    "half a ZIP": ("{archives}/half.zip {photos}/a.jpg -o {here}/out", 3, "one usable photo in the inputs"),
+    "a ZIP with a damaged file": ("{archives}/bad.zip -o {here}/out", 3, "bad.zip is damaged"),
+    "a ZIP that leads out": ("{archives}/out.zip -o {here}/out", 3, "leads out of it: ../a.jpg"),
+    "a ZIP that explodes": ("{archives}/bomb.zip -o {here}/out", 3, "would unpack to"),
+    "a ZIP where the run writes": ("{here}/old/photos/x.zip -o {here}/old", 3, "keeps its own files"),
+    "a folder of videos that do not move": ("{videos}/stills -o {here}/out", 3, "the camera does not move in it"),
     "a list of photos with a video": ("{videos}/clip.avi -o {here}/out --images {here}/list.txt", 2, "--images"),
     "a video where the run writes": ("{here}/old/photos/x.avi -o {here}/old", 3, "keeps its own files"),
     "at most one frame of a video": ("{videos}/clip.avi -o {here}/out --max-frames 1", 2, "photos.max_frames"),
@@ -313,6 +329,8 @@ def some_videos(place, another):
     video(place / "clip.avi", [4] * 12)
     video(place / "still.avi", [0] * 12)
     video(place / "whole.mp4", [4] * 12, "mp4v")
+    (place / "stills").mkdir()
+    (place / "stills" / "a.avi").write_bytes((place / "still.avi").read_bytes())
     another.write_bytes((place / "clip.avi").read_bytes())
     whole = (place / "whole.mp4").read_bytes()
     (place / "half.mp4").write_bytes(whole[: len(whole) // 2])
@@ -324,12 +342,31 @@ def some_videos(place, another):
     (place / "head.avi").write_bytes((place / "clip.avi").read_bytes()[:6000])
 
 
+def some_archives(place):
+    """None can be used."""
+    place.mkdir()
+    for name, member, content in (
+        ("closed", "a.jpg", b"a photo"), ("half", "a.jpg", b"a photo"), ("bad", "a.jpg", b"a photo"),
+        ("out", "../a.jpg", b"a photo"), ("bomb", "a.jpg", bytes(10**6)),
+    ):  # fmt: skip
+        with zipfile.ZipFile(place / f"{name}.zip", "w", zipfile.ZIP_DEFLATED if name == "bomb" else 0) as made:
+            made.writestr(member, content)
+    zipfile.ZipFile(place / "empty.zip", "w").close()
+    whole = (place / "half.zip").read_bytes()
+    directory = whole.index(b"PK\1\2")
+    (place / "half.zip").write_bytes(whole[:directory])
+    (place / "bad.zip").write_bytes(whole.replace(b"a photo", b"a phot0"))
+    (place / "closed.zip").write_bytes(whole[: directory + 8] + b"\1" + whole[directory + 9 :])
+
+
 @pytest.mark.parametrize("case", COMMANDS)
 def test_every_refusal_is_one_line_and_a_hint(folder, tmp_path, case):
     arguments, code, words = COMMANDS[case]
     (tmp_path / "old" / "photos").mkdir(parents=True)
     (tmp_path / "old" / "photos" / "a.jpg").symlink_to(folder / "a.jpg")
     some_videos(tmp_path / "videos", tmp_path / "old" / "photos" / "x.avi")
+    some_archives(tmp_path / "archives")
+    (tmp_path / "old" / "photos" / "x.zip").write_bytes((tmp_path / "archives" / "bad.zip").read_bytes())
     for name in ("held", "colmap/sparse"):
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / "empty.txt").write_text("")
@@ -337,7 +374,7 @@ def test_every_refusal_is_one_line_and_a_hint(folder, tmp_path, case):
 
     with FileLock(tmp_path / "held" / LOCK):
         before = {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")}
-        places = {"here": tmp_path, "photos": folder, "videos": tmp_path / "videos"}
+        places = {"here": tmp_path, "photos": folder, "videos": tmp_path / "videos", "archives": tmp_path / "archives"}
         result = call("run", *(word.format(**places) for word in arguments.split()))
 
     assert result.exit_code == code, result.stderr
@@ -353,7 +390,7 @@ def odd_inputs_page():
 
     states = {case: "used" if says == USED else f"left out: {says}".rstrip(": ") for case, (*_, says) in FILES.items()}
     files = [(case, FILES[case][1], says) for case, says in states.items()]
-    places, end = {"here": "HERE", "photos": "PHOTOS", "videos": "VIDEOS"}, "\n"
+    places, end = {name: name.upper() for name in ("here", "photos", "videos", "archives")}, "\n"
     commands = [(case, words.format(**places), code, says) for case, (words, code, says) in COMMANDS.items()]
     return f"""# Odd inputs and their results
 
