@@ -90,7 +90,7 @@ def cached_ratio_matches(data: Path, name: str, cache: Path) -> Path:
         print(f"matching {name}", file=sys.stderr)
         cache.mkdir(parents=True, exist_ok=True)
         with open_run(cache / name, Settings(), None) as run:
-            graph = run_stages(data / name / "images", run, last=MATCH_GRAPH.name)[MATCH_GRAPH]
+            graph = run_stages([data / name / "images"], run, last=MATCH_GRAPH.name)[MATCH_GRAPH]
         truth = load_truth(data / name / "cameras.json")
         arrays: dict[str, Any] = {}
         for ids in graph.matches:

@@ -142,7 +142,7 @@ def lens_alone(folder: Folder, args: argparse.Namespace) -> Row:
     photos, truth = render_folder(folder, args.cache)
     out = args.cache / "matches" / folder.name
     with open_run(out, Settings(), None) as run:
-        run_stages(photos, run, last=MATCH_GRAPH.name)
+        run_stages([photos], run, last=MATCH_GRAPH.name)
     row = lens_row(out / "database.db", truth, reach_of_features(out / "database.db", truth))
     return {
         "method": OURS, "scene": folder.scene, "projection": folder.projection, "field deg": folder.field_deg, **row

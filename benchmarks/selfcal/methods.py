@@ -64,7 +64,7 @@ def match_set(photos: PhotoSet, cache: Path, seed: int = 0) -> MatchedSet:
     settings = Settings.from_mapping({"seed": seed, "workers": 1, "photos": {"cameras": photos.cameras}})
     out = cache / "out" / photos.folder.name
     with open_run(out, settings, None) as run:
-        products = run_stages(photos.folder, run, last=VIEW_GRAPH.name)
+        products = run_stages([photos.folder], run, last=VIEW_GRAPH.name)
         matches, views = products[MATCH_GRAPH], products[VIEW_GRAPH]
         seconds = run.workspace.manifest.read()["stages"]["match_graph"]["seconds"]
     return MatchedSet(photos, out, settings, matches, views, seconds)
@@ -76,7 +76,7 @@ def run_production(
     """Run the stage `intrinsics` in full, with other settings where given."""
     settings = Settings.from_mapping(merge_nested(subject.settings.model_dump(), overrides or {}))
     with open_run(subject.out, settings, None) as run:
-        found = run_stages(subject.photos.folder, run, first=INTRINSICS.name, last=INTRINSICS.name)[INTRINSICS]
+        found = run_stages([subject.photos.folder], run, first=INTRINSICS.name, last=INTRINSICS.name)[INTRINSICS]
         seconds = run.workspace.manifest.read()["stages"]["intrinsics"]["seconds"]
     cameras = {Path(image.name).stem: image_camera(image, found) for image in subject.matches.images.values()}
     return MethodResult(label, cameras, seconds, len(subject.views.fits))

@@ -70,7 +70,7 @@ def matches_of(photos: Path, out: Path) -> MatchGraph:
     """Return keypoints and raw matches, as the program finds them."""
     print(f"matching {photos}", file=sys.stderr)
     with open_run(out, Settings(), None) as run:
-        return run_stages(photos, run, last=MATCH_GRAPH.name)[MATCH_GRAPH]
+        return run_stages([photos], run, last=MATCH_GRAPH.name)[MATCH_GRAPH]
 
 
 def keep(folder: Path, problem: Problem) -> None:

@@ -79,7 +79,7 @@ def first_photos(whole: SurfaceSet, count: int, cache: Path) -> SurfaceSet:
 def finished_model(photos: Path, out: Path, settings: Settings) -> Model:
     """Read the textured surface of a finished run, or the one with vertex colors where there is no texture."""
     with open_run(out, settings, None) as run:
-        return run_stages(photos, run, last=TEXTURE.name)[TEXTURE]
+        return run_stages([photos], run, last=TEXTURE.name)[TEXTURE]
 
 
 def dense_stages() -> Sequence[str]:

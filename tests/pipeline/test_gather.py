@@ -13,6 +13,7 @@ from PIL import Image
 
 from sfm_app.api import reconstruct
 from sfm_app.errors import InputError, SfmError
+from sfm_app.photos import gather
 from sfm_app.photos.gather import expand, fill, find
 from sfm_app.runtime.workspace import LOCK
 from sfm_app.settings import Settings
@@ -215,3 +216,20 @@ def test_a_killed_run_of_several_videos_keeps_its_choices(tmp_path, monkeypatch)
     found = run([tmp_path / "films"], tmp_path / "out")["counts"]
     assert looked == ["a.avi", "b.avi"] and found["cameras"] == 2
     assert not list((tmp_path / "out" / "frames").rglob("*.txt"))
+
+
+def test_a_kill_while_inputs_are_gathered_leaves_the_earlier_ones(tmp_path, mixed, monkeypatch):
+    run(mixed, tmp_path / "out")
+    inputs = tmp_path / "out" / ".inputs"
+    before = sorted(path.relative_to(inputs) for path in inputs.rglob("*"))
+
+    def kill(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as broken:
+        broken.setattr(gather, "_unpack", kill)
+        with pytest.raises(KeyboardInterrupt):
+            run(mixed[1:], tmp_path / "out")
+    assert sorted(path.relative_to(inputs) for path in inputs.rglob("*")) == before
+    assert run(mixed[1:], tmp_path / "out")["counts"]["usable"] == 2
+    assert not (inputs / "a.png").exists()

@@ -72,7 +72,7 @@ def photo_sequence(data: Path, name: str, cache: Path) -> ImageSequence:
     """Read the raw matches of the pairs that the program keeps, from CACHE/NAME, or make them from DATA/NAME/images."""
     place = data / PHOTOS[name]
     with open_run(cache / PHOTOS[name], Settings(), None) as run:
-        products = run_stages(place / "images", run, last=VIEW_GRAPH.name)
+        products = run_stages([place / "images"], run, last=VIEW_GRAPH.name)
         graph = products[MATCH_GRAPH]
         views = products[VIEW_GRAPH]
     matches = {pair: np.hstack(graph.points(pair)) for pair, fit in views.fits.items() if not fit.degeneracy}
