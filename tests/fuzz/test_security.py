@@ -26,12 +26,12 @@ UNPICKLES_WHAT_IT_SENT = Path(sfm_app.__file__).parent / "runtime/cluster.py"
 """Checks hashes that come with the messages of a cluster."""
 CALLS_ITS_OWN_PROCESS = Path(sfm_app.__file__).parent / "colmap/worker_process.py"
 """Sends calls to a process that it started, through a pipe, and takes their results."""
-SERVES_THIS_MACHINE = Path(sfm_app.__file__).parent / "report/server.py"
-"""Listens on 127.0.0.1 only."""
+SERVES_MODELS = Path(sfm_app.__file__).parent / "report/server.py"
+"""Listens on 127.0.0.1, or where the user says, to those who have the token."""
 KNOWN = {
     UNPICKLES_WHAT_IT_SENT: ["imports pickle"],
     CALLS_ITS_OWN_PROCESS: ["imports pickle"],
-    SERVES_THIS_MACHINE: ["imports http", "imports http.server"],
+    SERVES_MODELS: ["imports socket", "imports http", "imports http.server", "imports urllib.parse"],
 }
 RUNS_TEXT = {"eval", "exec", "compile", "__import__", "breakpoint", "os.system", "os.popen", "os.startfile"}
 
