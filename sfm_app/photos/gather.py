@@ -3,6 +3,7 @@
 import contextlib
 import glob
 import json
+import os
 import shutil
 import zipfile
 import zlib
@@ -20,6 +21,9 @@ MOST_ZIP_BYTES = 100_000_000_000
 """Unpacked size of an archive: thousands of large photos."""
 MOST_RATIO = 200
 """Unpacked size by packed size: photos hardly shrink, and bombs shrink a thousandfold."""
+MOST_NAME_BYTES = 255
+"""Bytes of a name on common file systems."""
+MISSING_HINT = 'name photos, folders or a ZIP archive, with quotes around a name with spaces: "My photos"'
 ZIP_HINT = "unpack it yourself, and name the folder"
 
 
@@ -92,7 +96,7 @@ def find(inputs: Sequence[Path], out: Path, masks: str = "") -> Gathered:
                 elif source != mask_place:
                     found.add(f"{folder}/{name}", label, source)
         elif not path.is_file():
-            raise InputError(f"no such file or folder: {path}", hint="name photos, folders or a ZIP archive")
+            raise InputError(f"no such file or folder: {path}", hint=MISSING_HINT)
         elif not is_video(read_head(path)) and zipfile.is_zipfile(path):
             folder = free(path.stem)
             for name, member in _members(path).items():
@@ -153,6 +157,8 @@ def _members(archive: Path) -> dict[str, str]:
                 raise InputError(f"{archive} is encrypted", hint=ZIP_HINT)
             if not is_below(one.filename):
                 raise InputError(f"{archive} has a file that leads out of it: {one.filename}", hint=ZIP_HINT)
+            if any(len(os.fsencode(part)) > MOST_NAME_BYTES for part in PurePosixPath(one.filename).parts):
+                raise InputError(f"{archive} has a file whose name is too long: {one.filename}", hint=ZIP_HINT)
         return {PurePosixPath(one.filename).as_posix(): one.filename for one in members}
 
 

@@ -90,6 +90,13 @@ def test_archives_that_lead_out_or_explode_are_refused(tmp_path, name, content):
         gathered([tmp_path / "z.zip"], tmp_path / "out" / "inputs")
 
 
+def test_a_member_with_too_long_a_name_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "z.zip", "w") as packed:
+        packed.writestr(f"in/{'ä' * 130}.jpg", b"a photo")
+    with pytest.raises(InputError, match="too long"):
+        gathered([tmp_path / "z.zip"], tmp_path / "out" / "inputs")
+
+
 def test_damaged_archives_raise_named_errors_only(tmp_path, archive):
     data, rng = archive.read_bytes(), np.random.default_rng(0)
     for _ in range(200):

@@ -150,12 +150,17 @@ def folder(tmp_path):
         (("ran",), "No such command 'ran'"),
         (("{folder}",), "sfm-app run {folder}"),
         (("run", "photos", "--scale", "24cm"), 'two points and their distance: "measure" in the report prints them.'),
-        (("run", "My", "photos", "-o", "out"), '(photos). Put quotes around a name with spaces: "My photos"'),
+        (("view", "My", "photos"), '(photos). Put quotes around a name with spaces: "My photos"'),
     ],
 )
 def test_mistyped_commands_are_explained(folder, words, text):
     result = call(*(word.format(folder=folder) for word in words))
     assert result.exit_code == 2 and text.format(folder=folder) in result.stderr
+
+
+def test_a_name_with_spaces_wants_quotes():
+    result = call("run", "My", "photos", "-o", "out")
+    assert result.exit_code == 3 and "My" in result.stderr and "quotes around a name with spaces" in result.stderr
 
 
 def test_only_a_folder_that_exists_is_suggested_for_a_run(tmp_path):
