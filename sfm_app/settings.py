@@ -277,16 +277,12 @@ class DepthSettings(Section):
 class MeshSettings(Section):
     """The surface through the depth maps."""
 
-    poisson_depth: int = Field(12, ge=5, le=14, description="greatest depth of the Poisson octree")
-    trim: bool = Field(True, description="remove surface that no photo confirms; false: close large holes by a guess")
-    max_gap_triangles: float = Field(
-        20.0, ge=0, le=1000, description="largest width of a gap in the confirmed surface that is closed, in triangles"
-    )
+    watertight: bool = Field(False, description="close the surface where no photo sees it, by a guess, for printing")
     min_island: float = Field(
         0.003, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped"
     )
     max_error_edges: float = Field(
-        0.15, ge=0, le=10, description="most that simplification may move the surface, in edges of Poisson's triangles"
+        0.15, ge=0, le=10, description="most that simplification may move the surface, in edges of its triangles"
     )
     max_image_size_px: int = Field(
         1600,
@@ -319,7 +315,7 @@ class TextureSettings(Section):
     trim_borders: bool = Field(
         True,
         description="remove borders of the surface where photos disagree about the color: they show the background; "
-        "false, or where `mesh.trim` is false: keep them",
+        "false, or where `mesh.watertight` is true: keep them",
     )
     normal_map: bool = Field(
         False,
@@ -445,14 +441,14 @@ QUALITY_PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "matching": {"max_features": 3072, "enlarge_below": 2000},
         "depth": {"max_image_size_px": 640, "neighbors": 3},
-        "mesh": {"poisson_depth": 10, "faces": 50_000, "max_image_size_px": 0},
+        "mesh": {"faces": 50_000, "max_image_size_px": 0},
         "texture": {"max_atlas_px": 2048, "max_pages": 1},
     },
     "normal": {},
     "high": {
         "matching": {"max_image_size_px": 3200, "max_features": 16384, "enlarge_below": 8000},
         "depth": {"max_image_size_px": 1400, "neighbors": 5},
-        "mesh": {"poisson_depth": 13, "faces": 1_000_000, "max_image_size_px": 3200},
+        "mesh": {"faces": 1_000_000, "max_image_size_px": 3200},
         "texture": {"max_atlas_px": 8192},
     },
 }

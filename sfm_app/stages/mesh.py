@@ -8,31 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.dense import map_file, read_views
-from sfm_app.colmap.surface import FUSED, open_points, positions
+from sfm_app.colmap.surface import FUSED, open_points
 from sfm_app.errors import ReconstructionError
 from sfm_app.files import digest_files, is_made_from
-from sfm_app.meshing.cleaning import drop_islands, make_manifold, trim
-from sfm_app.meshing.octree import CELLS, cell_sizes, cube_around
+from sfm_app.meshing.cleaning import drop_islands, make_manifold
 from sfm_app.meshing.refinement import STEPS
 from sfm_app.products import write_surface
-from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_count
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.stereo import View
-from sfm_app.surface.blocks import (
-    EVERYWHERE,
-    SurfaceJudge,
-    choose_record_cell,
-    judge_view,
-    mesh_in_blocks,
-    simplify_mesh,
-    span_surface,
-    with_halo,
-)
+from sfm_app.surface.blocks import mesh_in_blocks, simplify_mesh
 from sfm_app.surface.fusion import fuse_maps
 from sfm_app.surface.refining import FineShape, Originals, rank_partners, refine_surface, save_fine
-from sfm_app.tasks import Shared, Task
+from sfm_app.surface.spanning import Evidence, gather, span
 from sfm_app.types import Scene, Surface
 
 FUSED_DIGEST = "fused.txt"
@@ -49,7 +38,7 @@ def make(scene: Scene, dense_dir: Path, run: RunContext) -> Surface:
     points = _fused_points(dense_dir, views, run)
     originals = Originals(scene.model_dir, run.workspace.photos, run.mask_dir)
     if block_count(len(points), options) > 1:
-        surface = mesh_in_blocks(dense_dir, originals, views, points, _min_confirmed(views, run), run)
+        surface = mesh_in_blocks(dense_dir, originals, views, points, run)
     else:
         surface = _mesh_at_once((dense_dir, originals), views, points, run)
     run.record(vertices=len(surface.vertices), triangles=len(surface.faces))
@@ -61,13 +50,15 @@ def _mesh_at_once(
     source: tuple[Path, Originals], views: list[View], points: NDArray[np.void], run: RunContext
 ) -> Surface:
     (dense_dir, originals), options = source, run.settings.mesh
-    raw = _check_nonempty(_span(points, run), "the fused points span no surface")
-    judges = SurfaceJudge.prepare(raw, dense_dir, run.settings.depth.consistency)
-    judged = ordered_map(run.executor, Task(judge_view, Shared(judges)), views, ahead=run.workers)
-    colored, support = judges.sum_up(track(run.progress, judged, "confirming the surface", len(views)))
-    confirmed = _min_confirmed(views, run)
-    trimmed = trim(colored, support, options.max_gap_triangles, confirmed) if options.trim else colored
-    detailed = _check_nonempty(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
+
+    def spread(ask: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[Any]:
+        return ordered_map(run.executor, ask, items, ahead=run.workers)
+
+    with run.step("finding the surface"):
+        evidence = Evidence(dense_dir, views, run.settings.depth.consistency, spread)
+        raw, _ = span(gather(points, views), evidence, close=options.watertight)
+    run.record(raw_triangles=len(raw.faces))
+    detailed = _check_nonempty(drop_islands(raw, options.min_island), "the photos confirm no part of the surface")
     run.record(detailed_triangles=len(detailed.faces))
     if options.max_image_size_px:
         detailed = _refine(detailed, originals, views, run)
@@ -76,24 +67,6 @@ def _mesh_at_once(
     with run.step("simplifying"):
         simple = make_manifold(simplify_mesh(detailed, options, run.workspace.surface, run.workers))
     return _check_nonempty(simple, "the surface has no extent")
-
-
-def _span(points: NDArray[np.void], run: RunContext) -> Surface:
-    """Return Poisson's surface of all points, as fine as their density and the wanted number of triangles allow."""
-    options, xyz = run.settings.mesh, positions(points)
-    bounds = np.stack([xyz.min(axis=0), xyz.max(axis=0)])
-    if (extent := float(np.ptp(bounds, axis=0).max())) == 0.0:
-        raise ReconstructionError("the fused points have no extent", hint=HINT)
-    # without refinement, 1.6 occupied cells per final triangle: four triangles are simplified to one (at `draft`)
-    max_cells = np.inf if options.max_image_size_px else 1.6 * options.faces
-    sizes = list(cell_sizes(extent, options.poisson_depth))
-    with run.step("finding the surface"):
-        cell = choose_record_cell(sizes, lambda: [points], max(CELLS.least_points, len(xyz) / max_cells))
-        cube = cube_around(bounds[0], bounds[1], cell)
-        region = with_halo(bounds, cell) if options.trim else EVERYWHERE
-        surface, raw = span_surface(points, region, cube, run.workspace.surface)
-    run.record(cell=cell, raw_triangles=raw)
-    return surface
 
 
 def _refine(surface: Surface, originals: Originals, views: list[View], run: RunContext) -> Surface:
@@ -147,7 +120,3 @@ def _min_views(views: list[View], run: RunContext) -> int:
     """Return the number of photos that have to see a fused point."""
     return min(1 + run.settings.depth.min_agreeing, len(views))
 
-
-def _min_confirmed(views: list[View], run: RunContext) -> float:
-    """Return the number of photos that have to confirm the average vertex of a part."""
-    return 2 / 3 * _min_views(views, run)

@@ -35,7 +35,7 @@ def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
     is_hidden = Occluders(surface.vertices, surface.faces).is_hidden
     store = FileStore(run.workspace.photos, parts, run.mask_dir)
     options = run.settings.texture
-    if not run.settings.mesh.trim:  # a closed surface has no borders
+    if run.settings.mesh.watertight:  # a closed surface has no borders
         options = options.model_copy(update={"trim_borders": False})
     model, figures = texture_surface(surface, views, store, is_hidden, options, run.map)
     run.record(**figures)

@@ -6,29 +6,29 @@ resumes at the missing blocks.
 
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.dense import read_color, read_depth
-from sfm_app.colmap.surface import FUSED, poisson_surface, positions, simplify, write_points
+from sfm_app.colmap.dense import read_depth
+from sfm_app.colmap.surface import positions, simplify
 from sfm_app.errors import ReconstructionError
 from sfm_app.files import fingerprint, load_arrays, mark_unfinished, replace_atomically, resume_or_clear
-from sfm_app.geometry.triangles import Clusters, cluster, median_edge_length, select_faces, vertex_normals
+from sfm_app.geometry.triangles import Clusters, median_edge_length, select_faces
 from sfm_app.meshing.blocks import Partition, Split, close_cracks, split_points, weld
-from sfm_app.meshing.cleaning import Support, drop_islands, make_manifold, trim
-from sfm_app.meshing.octree import CELLS, Cube, cell_sizes, choose_cell, count_bent, count_cells, cube_around
-from sfm_app.meshing.visibility import CONFIRMED, NO_EVIDENCE, Paint, judge, sample_colors
+from sfm_app.meshing.cleaning import drop_islands, make_manifold
+from sfm_app.meshing.tetrahedra import Cloud, thin
 from sfm_app.operating_system import move
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import block_count, block_workers
 from sfm_app.settings import MeshSettings
 from sfm_app.stereo import View
 from sfm_app.surface.refining import FineShape, Originals, Partners, rank_partners, refine_surface, save_fine
-from sfm_app.tasks import Shared, Task
+from sfm_app.surface.spanning import Evidence, gather, span
+from sfm_app.tasks import Task
 from sfm_app.types import Surface
 from sfm_app.types.arrays import FloatArray
 
@@ -36,7 +36,8 @@ POINTS = "points"
 """Folder with one file of records per block: no block reads the points of all."""
 BLOCKS = "blocks"
 """Folder beside the surface while its blocks are made."""
-EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])
+CONTEXT = "context.npz"
+"""File with few points of all blocks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +49,11 @@ class BlockOptions:
     sample: int = 4_000_000
     """Points that determine the blocks, at most twice as many. Chosen by hand."""
     halo: int = 24
-    """Cells around a box to which the surface of its points reaches. Gaps of twenty triangles are closed in the same
-    way from both sides, and Poisson's surface does not depend on the end of the points. Chosen by hand."""
-    least_confirmed: int = 200
-    """Vertices of a block that a photo has to confirm to take part in the refinement. Chosen by hand."""
+    """Cells around a box to which the surface of its points reaches: gaps are closed in the same way from both sides.
+    Chosen by hand."""
+    context: float = 8.0
+    """Distance of the points outside a block, in distances of those inside: lines of sight to them pass through the
+    block. Chosen by hand."""
     weld_halo: float = 8.0
     """Cells from a plane over which a block is deformed to fit its neighbor. Chosen by hand."""
     crack: float = 2.0
@@ -111,103 +113,9 @@ def sort_points(
     return blocks
 
 
-def choose_record_cell(
-    sizes: Sequence[float], read: Callable[[], Iterable[NDArray[np.void]]], least: float = CELLS.least_points
-) -> float:
-    """Return the result of `choose_cell` for fused points, which may exceed the memory: `read` yields their parts."""
-
-    def points_per_cell(cell: float) -> float:
-        points, occupied = np.sum([(len(part), count_cells(positions(part), cell)) for part in read()], axis=0)
-        return float(points / occupied)
-
-    def bent_share(cell: float) -> float:
-        bent, several = np.sum([count_bent(positions(part), _normals(part), cell) for part in read()], axis=0)
-        return float(bent / max(several, 1))
-
-    return choose_cell(sizes, points_per_cell, bent_share, least)
-
-
-def _normals(records: NDArray[np.void]) -> FloatArray:
-    return np.stack([records[f"n{c}"] for c in "xyz"], axis=1).astype(np.float64)
-
-
 def with_halo(bounds: FloatArray, cell: float) -> FloatArray:
     """Return (..., 2, 3) bounds with their halo; bounds (..., 2, 3) lowest and highest coordinates."""
     return bounds + OPTIONS.halo * cell * np.array([-1.0, 1.0])[:, None]
-
-
-def span_surface(records: NDArray[np.void], bounds: FloatArray, cube: Cube, place: Path) -> tuple[Surface, int]:
-    """Return Poisson's surface of records (N,) within bounds (2, 3), and the number of triangles of all of it."""
-    # two more points enlarge the cube of the octree until its cells have the size of `cube`
-    anchors = np.zeros(2, records.dtype)
-    for axis, letter in enumerate("xyz"):
-        anchors[letter] = cube.anchors[:, axis]
-        anchors[f"n{letter}"] = 3.0**-0.5
-    with tempfile.TemporaryDirectory(dir=place, prefix="poisson-") as scratch:
-        write_points([anchors, records], Path(scratch) / FUSED)
-        raw = poisson_surface(Path(scratch), cube.depth)
-    inside = ((raw.vertices >= bounds[0]) & (raw.vertices <= bounds[1])).all(axis=1)
-    return select_faces(raw, inside[raw.faces].all(axis=1)), len(raw.faces)
-
-
-Judgment = tuple[NDArray[np.int64], NDArray[np.uint8], Paint]
-"""The judgment of one photo: vertices (N,), its verdict on each (N,), and its colors there."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SurfaceJudge:
-    """The judgment of photos on the vertices of a surface, and their colors."""
-
-    surface: Surface
-    normals: NDArray[np.float64]
-    """(V, 3)."""
-    clusters: Clusters
-    dense_dir: Path
-    tolerance: float
-    """Relative difference in depth within which a photo confirms a vertex."""
-
-    @classmethod
-    def prepare(cls, surface: Surface, dense_dir: Path, tolerance: float) -> "SurfaceJudge":
-        """Prepare for a surface from Poisson reconstruction."""
-        normals = vertex_normals(surface.vertices, surface.faces)
-        return cls(surface, normals, cluster(surface.vertices[:, None, :]), dense_dir, tolerance)
-
-    def judge(self, view: View) -> Judgment:
-        """Return the judgment of a photo on the vertices in view."""
-        depth = read_depth(self.dense_dir, view, "geometric")
-        near = self.clusters.find_in_cone(view.center, view.axis, view.widest_angle)
-        points, normals = self.surface.vertices[near], self.normals[near]
-        verdict = judge(points, normals, view, depth, view.sample_px, self.tolerance)
-        paint = sample_colors(points, normals, verdict, view, read_color(self.dense_dir, view))
-        judged = verdict != NO_EVIDENCE
-        return near[judged], verdict[judged], Paint(paint.total[judged], paint.weight[judged])
-
-    def sum_up(self, judgments: Iterable[Judgment]) -> tuple[Surface, Support]:
-        """Return the surface with colors from the photos, and their support for each of its vertices."""
-        support, paint = Support.zeros(len(self.normals)), Paint.zeros(len(self.normals))
-        for at, verdict, colors in judgments:
-            support.add(at, verdict)
-            paint.add(at, colors)
-        surface = self.surface
-        return Surface(surface.vertices, surface.faces, paint.mean_colors(surface.vertices)), support
-
-
-def judge_by_all(judge: SurfaceJudge, views: Sequence[View]) -> tuple[Surface, Support, list[View]]:
-    """Return the result of `sum_up`, and the photos that confirm enough of the surface to refine it."""
-    witnesses = list[View]()
-
-    def judge_by(view: View) -> Judgment:
-        judgment = judge.judge(view)
-        if np.count_nonzero(judgment[1] == CONFIRMED) >= OPTIONS.least_confirmed:
-            witnesses.append(view)
-        return judgment
-
-    return *judge.sum_up(map(judge_by, views)), witnesses
-
-
-def judge_view(judges: Shared[SurfaceJudge], view: View) -> Judgment:
-    """Return the judgment of a photo on the vertices in view, on any machine."""
-    return judges.value.judge(view)
 
 
 def simplify_mesh(surface: Surface, options: MeshSettings, scratch: Path, threads: int = 1) -> Surface:
@@ -233,12 +141,9 @@ class BlockTask:
     number: int
     bounds: FloatArray
     """(2, 3) bounds of its points and halo."""
-    cube: Cube
     options: MeshSettings
     tolerance: float
     """Relative difference in depth within which a photo confirms a vertex."""
-    least: float
-    """Photos that have to confirm the average vertex of a part."""
     keeps_fine: bool
     """Whether its surface is also kept before simplification."""
 
@@ -254,30 +159,27 @@ class BlockTask:
 
 
 def mesh_in_blocks(
-    dense_dir: Path, originals: Originals, views: Sequence[View], points: NDArray[np.void], least: float,
-    run: RunContext,
-) -> Surface:  # fmt: skip
-    """Return the surface of all points, block by block; `least` photos confirm the average vertex of a part."""
+    dense_dir: Path, originals: Originals, views: Sequence[View], points: NDArray[np.void], run: RunContext
+) -> Surface:
+    """Return the surface of all points, block by block."""
     options = run.settings.mesh
     folder = run.workspace.surface / BLOCKS
     made_from = fingerprint(run.fingerprint, len(points), options.model_dump())
     if not resume_or_clear(folder, made_from):
         mark_unfinished(folder, made_from)
     with run.step("sorting the points"):
-        partition = split_points(
-            positions(points[:: max(1, len(points) // OPTIONS.sample)]), block_count(len(points), options)
-        )
+        sample = np.asarray(points[:: max(1, len(points) // OPTIONS.sample)])
+        partition = split_points(positions(sample), block_count(len(points), options))
         own = sort_points(points, partition, folder)
-        sizes = sizes_for_blocks(own.bounds, options.poisson_depth)
-        cell = choose_record_cell(sizes, lambda: map(own.read, range(len(own.bounds))))
+        cloud = gather(sample, views)
+        cell = float(np.median(cloud.step))
+        save_cloud(thin(cloud.points, cloud.normals, cloud.colors, OPTIONS.context * cloud.step), folder / CONTEXT)
     bounds = with_halo(own.bounds, cell)
-    cubes = [cube_around(low, high, cell) for low, high in bounds]
     farthest = run.map(Task(farthest_depth, dense_dir), views, "measuring depths")
     partners = rank_partners(views)
     tasks = [
         BlockTask(folder, own, dense_dir, originals, near, {view.name: partners[view.name] for view in near},
-                  k, bounds[k], cubes[k], options, run.settings.depth.consistency, least,
-                  run.settings.texture.normal_map)
+                  k, bounds[k], options, run.settings.depth.consistency, run.settings.texture.normal_map)
         for k, near in enumerate(_photos_in_reach(views, farthest, bounds))
     ]  # fmt: skip
     with run.with_workers(block_workers(run.workers, run.memory_mb, options)) as few:
@@ -304,17 +206,19 @@ def mesh_in_blocks(
 
 
 def mesh_block(task: BlockTask) -> int:
-    """Write the surface of a block and its halo, unless a killed run has; return the number of Poisson's triangles."""
+    """Write the surface of a block and its halo, unless a killed run has; return the number of its triangles."""
     if task.path.exists():
         return int(load_arrays(task.path)["raw"])
     # a worker that was cut off from a cluster may still be at the same block
     scratch = Path(tempfile.mkdtemp(dir=task.folder, prefix=f"{task.number}-"))
-    near, raw = span_surface(task.points.read_box(task.bounds), task.bounds, task.cube, scratch)
-    judge = SurfaceJudge.prepare(near, task.dense_dir, task.tolerance)
-    surface, support, witnesses = judge_by_all(judge, task.views)
-    if task.options.trim and len(surface.faces):
-        surface = trim(surface, support, task.options.max_gap_triangles, task.least)
-    if len(surface.faces) and task.options.max_image_size_px:
+    evidence = Evidence(task.dense_dir, task.views, task.tolerance)
+    near = gather(task.points.read_box(task.bounds), task.views)
+    context = load_cloud(task.folder / CONTEXT, task.bounds)
+    whole, witnesses = span(near, evidence, close=task.options.watertight, context=context)
+    inside = ((whole.vertices >= task.bounds[0]) & (whole.vertices <= task.bounds[1])).all(axis=1)
+    surface = select_faces(whole, inside[whole.faces].all(axis=1))
+    raw = len(surface.faces)
+    if raw and task.options.max_image_size_px:
         surface = refine_surface(surface, task.originals, witnesses, task.partners, task.options).surface
     if task.keeps_fine:
         save_fine([FineShape.from_surface(surface)], task.fine_path)
@@ -326,6 +230,19 @@ def mesh_block(task: BlockTask) -> int:
     return raw
 
 
+def save_cloud(cloud: Cloud, path: Path) -> None:
+    """Write points atomically."""
+    with replace_atomically(path) as beside:
+        np.savez(beside, points=cloud.points, normals=cloud.normals, colors=cloud.colors, step=cloud.step)
+
+
+def load_cloud(path: Path, bounds: FloatArray) -> Cloud:
+    """Read the points outside bounds (2, 3)."""
+    stored = load_arrays(path)
+    cloud = Cloud(*(stored[name] for name in ("points", "normals", "colors", "step")))
+    return cloud.select(((cloud.points < bounds[0]) | (cloud.points > bounds[1])).any(axis=1))
+
+
 def join_blocks(node: Split | int, tasks: Sequence[BlockTask], cell: float) -> tuple[Surface, int]:
     """Return the joined surface of all blocks below a node, and the number of open edges at their faces."""
     if not isinstance(node, Split):
@@ -334,17 +251,6 @@ def join_blocks(node: Split | int, tasks: Sequence[BlockTask], cell: float) -> t
     (low, low_edges), (high, high_edges) = (join_blocks(half, tasks, cell) for half in (node.low, node.high))
     joined, edges = weld(low, high, node.axis, node.at, cell, OPTIONS.weld_halo * cell)
     return joined, edges + low_edges + high_edges
-
-
-def sizes_for_blocks(bounds: FloatArray, most: int) -> list[float]:
-    """Return sides of cells, the finest first, with octrees of depth <= `most` in blocks of these bounds (B, 2, 3)."""
-    extent = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
-
-    def deepest(cell: float) -> int:
-        return max(cube_around(low, high, cell).depth for low, high in with_halo(bounds, cell))
-
-    sizes = list(cell_sizes(extent, CELLS.deepest))
-    return [cell for cell in sizes if deepest(cell) <= most] or sizes[-1:]
 
 
 def farthest_depth(dense_dir: Path, view: View) -> float:

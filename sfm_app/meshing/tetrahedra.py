@@ -1,0 +1,356 @@
+"""The surface between what photos see through and what they see: a minimum cut of tetrahedra.
+
+Labatut, Pons and Keriven (Computer Graphics Forum 2009): points become a Delaunay tetrahedralization. The line of sight
+from a photo to a point says that the tetrahedra before the point are free, and that the one behind it is full. The cut
+with the least contradiction is a closed surface; where photos show nothing, it is small.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import inlined_kernel, kernel
+from sfm_app.meshing.min_cut import sink_side
+from sfm_app.types import Surface
+from sfm_app.types.arrays import FloatArray, IndexArray
+
+
+@dataclass(frozen=True, slots=True)
+class CutOptions:
+    """Distances and weights of the cut."""
+
+    spacing_px: float = 2.5
+    """Distance of the points in pixels of the depth maps."""
+    sigma: float = 1.0
+    """Uncertainty of a point along a line of sight, in distances of the points."""
+    behind: float = 3.0
+    """Standard deviations behind a point at which it is full."""
+    beta: float = 1.0
+    """Weight of the shape of the triangles, in lines of sight."""
+    lines: int = 4
+    """Most lines of sight of a point; each stands for as many as there are."""
+
+
+OPTIONS = CutOptions()
+UNIT = 256.0
+"""Capacity of one line of sight: integers have the same sum in any order."""
+FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+"""Corners of the face opposite to each corner, counter-clockwise seen from outside."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """Points on surfaces, about as dense as depth maps can tell apart."""
+
+    points: FloatArray
+    """(N, 3)."""
+    normals: FloatArray
+    """(N, 3) unit, towards the photos."""
+    colors: NDArray[np.uint8]
+    """(N, 3) RGB."""
+    step: FloatArray
+    """(N,) distance to the next points."""
+
+    def select(self, keep: NDArray[np.bool_]) -> "Cloud":
+        """Return the marked points (N,)."""
+        return Cloud(self.points[keep], self.normals[keep], self.colors[keep], self.step[keep])
+
+
+def thin(points: FloatArray, normals: FloatArray, colors: NDArray[np.uint8], step: FloatArray) -> Cloud:
+    """Return the means of the points (N, 3) in cubes whose sides are the powers of two closest to their steps (N,)."""
+    level = np.rint(np.log2(step)).astype(np.int64)
+    cells = np.floor(points / np.exp2(level)[:, None]).astype(np.int64)
+    keys = np.column_stack([level, cells])
+    _, own, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    own = own.ravel()
+
+    def mean(values: NDArray[np.generic]) -> FloatArray:
+        return np.stack([np.bincount(own, column, len(count)) for column in values.T], axis=1) / count[:, None]
+
+    normal = mean(normals)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    steps = np.bincount(own, step, len(count)) / count
+    return Cloud(mean(points), normal, np.rint(mean(colors)).astype(np.uint8), steps)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sights:
+    """Lines of sight from photos to points."""
+
+    point: IndexArray
+    """(L,) ascending for each photo."""
+    center: FloatArray
+    """(L, 3) center of the photo."""
+    weight: NDArray[np.float32]
+    """(L,) photos for which the line stands."""
+
+    @classmethod
+    def choose(cls, seen: Sequence[IndexArray], centers: FloatArray, count: int, most: int = OPTIONS.lines) -> "Sights":
+        """Choose lines of sight to `count` points from the points that each photo sees, evenly among its photos."""
+        total, number = np.zeros(count, np.int64), np.zeros(count, np.int64)
+        for at in seen:
+            total[at] += 1
+        parts = list[tuple[IndexArray, FloatArray]]()
+        for at, center in zip(seen, centers, strict=True):
+            used = np.minimum(total[at], most)
+            chosen = (number[at] + 1) * used // total[at] > number[at] * used // total[at]
+            number[at] += 1
+            parts.append((at[chosen], np.broadcast_to(center, (np.count_nonzero(chosen), 3))))
+        point = np.concatenate([at for at, _ in parts])
+        weight = (total / np.maximum(np.minimum(total, most), 1)).astype(np.float32)
+        return cls(point, np.concatenate([center for _, center in parts]), weight[point])
+
+
+def cut_surface(cloud: Cloud, sights: Sights, options: CutOptions = OPTIONS) -> tuple[Surface, FloatArray]:
+    """Return the cut as an oriented manifold, closed except at the hull of all points, and (V,) the points' steps."""
+    from scipy.spatial import Delaunay
+
+    origin, scale = cloud.points.mean(axis=0), float(np.ptp(cloud.points, axis=0).max())
+    points = (cloud.points - origin) / scale
+    cells = Delaunay(points)
+    corners, neighbors = cells.simplices, cells.neighbors
+    _orient(points, corners, neighbors)
+    starts, around = _find_around(corners, len(points))
+    crossed, ends = np.zeros((len(corners), 4), np.float32), np.zeros(len(corners), np.float32)
+    sigma = options.sigma * cloud.step / scale
+    centers = (sights.center - origin) / scale
+    _cast(points, corners, neighbors, starts, around, sights.point, centers, sights.weight, sigma, options.behind,
+          crossed, ends)  # fmt: skip
+    _add_shape(points, corners, neighbors, options.beta, crossed)
+    capacity = np.rint(np.minimum(UNIT * crossed, 2.0**30)).astype(np.int32)
+    full = sink_side(neighbors, capacity, np.rint(UNIT * ends).astype(np.int64))
+    faces, vertices = _extract(corners, neighbors, full)
+    return Surface(cloud.points[vertices], faces, cloud.colors[vertices]), cloud.step[vertices]
+
+
+@kernel
+def _find_around(corners: NDArray[np.int32], count: int) -> tuple[IndexArray, NDArray[np.int32]]:
+    """Return where the tetrahedra around each of `count` points begin, and their numbers."""
+    starts = np.zeros(count + 1, np.int64)
+    for t in range(len(corners)):
+        for k in range(4):
+            starts[corners[t, k] + 1] += 1
+    for v in range(count):
+        starts[v + 1] += starts[v]
+    at, around = starts[:-1].copy(), np.empty(starts[-1], np.int32)
+    for t in range(len(corners)):
+        for k in range(4):
+            v = corners[t, k]
+            around[at[v]] = t
+            at[v] += 1
+    return starts, around
+
+
+@kernel
+def _orient(points: FloatArray, corners: NDArray[np.int32], neighbors: NDArray[np.int32]) -> None:
+    """Turn all tetrahedra so that the normals of their faces, by FACES, point outwards."""
+    n = np.empty(3)
+    for t in range(len(corners)):
+        a = _face_normal(points, corners, t, 0, n)
+        inwards = 0.0
+        for c in range(3):
+            inwards += n[c] * (points[corners[t, 0], c] - points[a, c])
+        if inwards > 0:
+            corners[t, 2], corners[t, 3] = corners[t, 3], corners[t, 2]
+            neighbors[t, 2], neighbors[t, 3] = neighbors[t, 3], neighbors[t, 2]
+
+
+@inlined_kernel
+def _face_normal(points: FloatArray, corners: NDArray[np.int32], t: int, k: int, n: FloatArray) -> int:
+    """Fill in the normal of a face, twice its area long, outwards; return a corner of it."""
+    a, b, c = corners[t, FACES[k, 0]], corners[t, FACES[k, 1]], corners[t, FACES[k, 2]]
+    ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+    vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+    n[0], n[1], n[2] = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    return a
+
+
+@kernel
+def _cast(  # noqa: PLR0913
+    points: FloatArray, corners: NDArray[np.int32], neighbors: NDArray[np.int32], starts: IndexArray,
+    around: NDArray[np.int32], seen: IndexArray, centers: FloatArray, weights: NDArray[np.float32], sigma: FloatArray,
+    behind: float, crossed: NDArray[np.float32], ends: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Add the lines of sight: `crossed` (T, 4) from each tetrahedron to its neighbors, in the direction of sight;
+    `ends` (T,) those that begin in it less those that end."""
+    d, n = np.empty(3), np.empty(3)
+    for line in range(len(seen)):
+        v, weight = seen[line], weights[line]
+        for c in range(3):
+            d[c] = centers[line, c] - points[v, c]
+        distance = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+        d /= distance
+        _walk(points, corners, neighbors, starts, around, v, d, n, distance, sigma[v], weight, True, crossed, ends)
+        d *= -1.0
+        reach = behind * sigma[v]
+        _walk(points, corners, neighbors, starts, around, v, d, n, reach, sigma[v], weight, False, crossed, ends)
+
+
+@inlined_kernel
+def _walk(  # noqa: PLR0913
+    points: FloatArray, corners: NDArray[np.int32], neighbors: NDArray[np.int32], starts: IndexArray,
+    around: NDArray[np.int32], v: int, d: FloatArray, n: FloatArray, reach: float, sigma: float, weight: float,
+    is_before: bool, crossed: NDArray[np.float32], ends: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Follow a line from a point, with unit direction d; close to the point, its faces count less."""
+    t, came, gone = _first(points, corners, starts, around, v, d, n), -1, 0.0
+    for _ in range(len(corners) if t >= 0 else 0):
+        leave, farther = -1, np.inf
+        for k in range(4):
+            if (came < 0 and corners[t, k] != v) or (came >= 0 and neighbors[t, k] == came):
+                continue
+            a = _face_normal(points, corners, t, k, n)
+            slope = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
+            if slope <= 0.0:
+                continue
+            height = 0.0
+            for c in range(3):
+                height += n[c] * (points[a, c] - points[v, c])
+            if height / slope < farther:
+                leave, farther = k, height / slope
+        if leave < 0:
+            return
+        gone = max(gone, farther)
+        after = neighbors[t, leave]
+        if gone >= reach or after < 0:
+            ends[t] += weight if is_before else -weight
+            return
+        share = weight * (1.0 - np.exp(-0.5 * (gone / sigma) ** 2))
+        if is_before:
+            for k in range(4):
+                if neighbors[after, k] == t:
+                    crossed[after, k] += share
+        else:
+            crossed[t, leave] += share
+        came, t = t, after
+
+
+@inlined_kernel
+def _first(
+    points: FloatArray, corners: NDArray[np.int32], starts: IndexArray, around: NDArray[np.int32], v: int,
+    d: FloatArray, n: FloatArray,
+) -> int:  # fmt: skip
+    """Return the tetrahedron that a direction enters from a point, -1 where it leaves the hull."""
+    best, least = -1, 1e-7
+    for at in range(starts[v], starts[v + 1]):
+        t, most = around[at], -np.inf
+        for k in range(4):
+            if corners[t, k] != v:
+                _face_normal(points, corners, t, k, n)
+                slope = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
+                most = max(most, slope / np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2] + 1e-300))
+        if most < least:
+            best, least = t, most
+    return best
+
+
+@kernel
+def _add_shape(
+    points: FloatArray, corners: NDArray[np.int32], neighbors: NDArray[np.int32], beta: float,
+    crossed: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Add to each face what it costs: nothing within a dense surface, up to 2 beta where its circumspheres are large.
+
+    It is one less the smaller cosine of its angles with the two circumspheres (Labatut 2009).
+    """
+    center, radius, n = np.empty((len(corners), 3)), np.empty(len(corners)), np.empty(3)
+    for t in range(len(corners)):
+        _circumsphere(points, corners, t, center, radius)
+    for t in range(len(corners)):
+        for k in range(4):
+            a, other = _face_normal(points, corners, t, k, n), neighbors[t, k]
+            size = np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]) + 1e-300
+            own, opposite = 0.0, 0.0
+            for c in range(3):
+                own += n[c] * (points[a, c] - center[t, c])
+                if other >= 0:
+                    opposite += n[c] * (center[other, c] - points[a, c])
+            cosine = own / (size * radius[t])
+            if other >= 0:
+                cosine = min(cosine, opposite / (size * radius[other]))
+            crossed[t, k] += beta * (1.0 - max(min(cosine, 1.0), -1.0))
+
+
+@inlined_kernel
+def _circumsphere(
+    points: FloatArray, corners: NDArray[np.int32], t: int, center: FloatArray, radius: FloatArray
+) -> None:
+    a, b, c, d = corners[t]
+    px, py, pz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+    qx, qy, qz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+    rx, ry, rz = points[d, 0] - points[a, 0], points[d, 1] - points[a, 1], points[d, 2] - points[a, 2]
+    pp, qq, rr = px * px + py * py + pz * pz, qx * qx + qy * qy + qz * qz, rx * rx + ry * ry + rz * rz
+    # x = (|p|^2 q x r + |q|^2 r x p + |r|^2 p x q) / (2 p . (q x r))
+    ax, ay, az = qy * rz - qz * ry, qz * rx - qx * rz, qx * ry - qy * rx
+    bx, by, bz = ry * pz - rz * py, rz * px - rx * pz, rx * py - ry * px
+    cx, cy, cz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
+    half = 2.0 * (px * ax + py * ay + pz * az)
+    half = half if abs(half) > 1e-300 else 1e-300
+    x, y, z = pp * ax + qq * bx + rr * cx, pp * ay + qq * by + rr * cy, pp * az + qq * bz + rr * cz
+    center[t, 0], center[t, 1], center[t, 2] = points[a, 0] + x / half, points[a, 1] + y / half, points[a, 2] + z / half
+    radius[t] = max(np.sqrt(x * x + y * y + z * z) / abs(half), 1e-300)
+
+
+def _extract(
+    corners: NDArray[np.int32], neighbors: NDArray[np.int32], full: NDArray[np.bool_]
+) -> tuple[IndexArray, IndexArray]:
+    """Return the faces (F, 3) between full and free tetrahedra, outwards, and (V,) the point of each vertex.
+
+    Triangles around an edge belong together by the full tetrahedra between them: parts of the surface that only touch
+    at an edge or a point do not share vertices there.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    t, k = np.nonzero(full[:, None] & (neighbors >= 0) & ~full[np.maximum(neighbors, 0)])
+    number = np.full((len(corners), 4), -1, np.int32)
+    number[t, k] = np.arange(len(t))
+    joined = np.empty((6 * len(t), 2), np.int64)
+    count = _join_corners(corners, neighbors, full, number, t, k, joined)
+    one, other = joined[:count].T
+    graph = coo_array((np.ones(count, np.bool_), (one, other)), (3 * len(t), 3 * len(t)))
+    _, vertex = connected_components(graph, directed=False)
+    at = np.take_along_axis(corners[t], FACES[k], axis=1)
+    points = np.empty(int(vertex.max(initial=-1)) + 1, np.int64)
+    points[vertex] = at.ravel()
+    return vertex.reshape(-1, 3).astype(np.int64), points
+
+
+@kernel
+def _join_corners(
+    corners: NDArray[np.int32], neighbors: NDArray[np.int32], full: NDArray[np.bool_], number: NDArray[np.int32],
+    tetrahedra: IndexArray, sides: IndexArray, joined: IndexArray,
+) -> int:  # fmt: skip
+    """Fill in pairs of corners (3 f + i) of faces that are one vertex; return how many.
+
+    From each edge of a face, the way leads around the edge through full tetrahedra to the next face.
+    """
+    count = 0
+    for f in range(len(tetrahedra)):
+        for i in range(3):
+            t, inner = tetrahedra[f], sides[f]  # `inner` faces the free side, and lies opposite to the face
+            first, second = corners[t, FACES[inner, i]], corners[t, FACES[inner, (i + 1) % 3]]
+            opposite = FACES[inner, (i + 2) % 3]  # the next face around the edge lies opposite to the third corner
+            while neighbors[t, opposite] >= 0 and full[neighbors[t, opposite]]:
+                kept, after = corners[t, inner], neighbors[t, opposite]
+                for j in range(4):
+                    if neighbors[after, j] == t:
+                        entry = j
+                for j in range(4):
+                    if corners[after, j] == kept:
+                        opposite = j
+                t, inner = after, entry
+            if neighbors[t, opposite] < 0:
+                continue  # the surface ends at the hull
+            g = number[t, opposite]
+            for j in range(3):
+                v = corners[t, FACES[opposite, j]]
+                if v == first:
+                    joined[count, 0], joined[count, 1] = 3 * f + i, 3 * g + j
+                    count += 1
+                elif v == second:
+                    joined[count, 0], joined[count, 1] = 3 * f + (i + 1) % 3, 3 * g + j
+                    count += 1
+    return count
