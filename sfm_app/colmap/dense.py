@@ -118,11 +118,6 @@ def read_gray(dense_dir: Path, view: View) -> NDArray[np.uint8]:
     return np.asarray(_decode(dense_dir, view.name, cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
-def read_color(dense_dir: Path, view: View) -> NDArray[np.uint8]:
-    """Return the undistorted photo (H, W, 3) of a view, RGB."""
-    return np.asarray(_decode(dense_dir, view.name, cv2.IMREAD_COLOR_RGB), np.uint8)
-
-
 def _decode(dense_dir: Path, name: str, flags: int) -> NDArray[np.uint8] | None:
     # imdecode, because OpenCV does not open names beyond ASCII on every system
     image = cv2.imdecode(np.fromfile(dense_dir / "images" / name, np.uint8), flags)

@@ -61,18 +61,6 @@ def positions(records: NDArray[np.void]) -> NDArray[np.float64]:
     return np.stack([records[c] for c in "xyz"], axis=1).astype(np.float64)
 
 
-def poisson_surface(folder: Path, depth: int) -> Surface:
-    """Return Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points of a folder.
-
-    All vertices have the same color. The finest cell is the largest extent of the points over 2^depth.
-    """
-    path = folder / "poisson.ply"
-    run_worker(partial(tasks.mesh_poisson, folder / FUSED, path, depth), "finding the surface")
-    surface = _read(path)
-    path.unlink()
-    return surface
-
-
 def simplify(surface: Surface, most: int, max_error: float, scratch: Path, threads: int = 1) -> Surface:
     """Collapse edges, cheapest first by their quadric error (Garland and Heckbert, SIGGRAPH 1997), of a manifold.
 

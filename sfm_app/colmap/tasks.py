@@ -113,16 +113,6 @@ def fuse(dense_dir: Path, min_views: int, box: NDArray[np.float64], target: Path
     check_written(target)
 
 
-def mesh_poisson(points: Path, target: Path, depth: int) -> None:
-    """Span a closed surface over points (Poisson)."""
-    options = pycolmap.PoissonMeshingOptions()
-    options.depth, options.trim = depth, 0.0
-    options.color = False  # it takes a tenth of the time, and the photos have better ones
-    options.num_threads = 1
-    pycolmap.poisson_meshing(points, target, options=options)
-    check_written(target)
-
-
 def simplify(mesh: Path, target: Path, most: int, max_error: float, threads: int) -> None:
     """Simplify a surface as far as its error allows, and then to at most the given number of triangles."""
     options = pycolmap.MeshSimplificationOptions()

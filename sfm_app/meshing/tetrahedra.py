@@ -7,6 +7,7 @@ with the least contradiction is a closed surface; where photos show nothing, it 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,32 +76,50 @@ def thin(points: FloatArray, normals: FloatArray, colors: NDArray[np.uint8], ste
     return Cloud(mean(points), normal, np.rint(mean(colors)).astype(np.uint8), steps)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sights:
+class Sights(NamedTuple):
     """Lines of sight from photos to points."""
 
     point: IndexArray
-    """(L,) ascending for each photo."""
+    """(L,)."""
     center: FloatArray
     """(L, 3) center of the photo."""
     weight: NDArray[np.float32]
     """(L,) photos for which the line stands."""
 
-    @classmethod
-    def choose(cls, seen: Sequence[IndexArray], centers: FloatArray, count: int, most: int = OPTIONS.lines) -> "Sights":
-        """Choose lines of sight to `count` points from the points that each photo sees, evenly among its photos."""
-        total, number = np.zeros(count, np.int64), np.zeros(count, np.int64)
-        for at in seen:
-            total[at] += 1
-        parts = list[tuple[IndexArray, FloatArray]]()
-        for at, center in zip(seen, centers, strict=True):
-            used = np.minimum(total[at], most)
-            chosen = (number[at] + 1) * used // total[at] > number[at] * used // total[at]
-            number[at] += 1
-            parts.append((at[chosen], np.broadcast_to(center, (np.count_nonzero(chosen), 3))))
-        point = np.concatenate([at for at, _ in parts])
-        weight = (total / np.maximum(np.minimum(total, most), 1)).astype(np.float32)
-        return cls(point, np.concatenate([center for _, center in parts]), weight[point])
+
+def choose_sights(
+    seen: Sequence[IndexArray], centers: FloatArray, count: int, most: int = OPTIONS.lines
+) -> Sights:
+    """Choose lines of sight to `count` points, at most `most` for each, evenly among the photos that see it.
+
+    `seen` has the points that each photo sees, each once, `centers` (P, 3) the centers of the photos.
+    """
+    total, number = np.bincount(np.concatenate(seen), minlength=count), np.zeros(count, np.int64)
+    used = np.minimum(total, most)
+    points, photos = list[IndexArray](), list[IndexArray]()
+    for photo, at in enumerate(seen):
+        step = number[at] * used[at]
+        chosen = (step + used[at]) // total[at] > step // total[at]
+        number[at] += 1
+        points.append(at[chosen])
+        photos.append(np.full(len(points[-1]), photo))
+    point = np.concatenate(points)
+    return Sights(point, centers[np.concatenate(photos)], (total[point] / used[point]).astype(np.float32))
+
+
+class Cells(NamedTuple):
+    """A Delaunay tetrahedralization."""
+
+    points: FloatArray
+    """(N, 3)."""
+    corners: NDArray[np.int32]
+    """(T, 4) points; FACES has the face opposite to each."""
+    neighbors: NDArray[np.int32]
+    """(T, 4) tetrahedra opposite to each corner, -1 outside the hull."""
+    starts: IndexArray
+    """(N + 1,) where the tetrahedra around each point begin."""
+    around: NDArray[np.int32]
+    """Tetrahedra around the points."""
 
 
 def cut_surface(cloud: Cloud, sights: Sights, options: CutOptions = OPTIONS) -> tuple[Surface, FloatArray]:
@@ -109,19 +128,16 @@ def cut_surface(cloud: Cloud, sights: Sights, options: CutOptions = OPTIONS) -> 
 
     origin, scale = cloud.points.mean(axis=0), float(np.ptp(cloud.points, axis=0).max())
     points = (cloud.points - origin) / scale
-    cells = Delaunay(points)
-    corners, neighbors = cells.simplices, cells.neighbors
-    _orient(points, corners, neighbors)
-    starts, around = _find_around(corners, len(points))
-    crossed, ends = np.zeros((len(corners), 4), np.float32), np.zeros(len(corners), np.float32)
-    sigma = options.sigma * cloud.step / scale
-    centers = (sights.center - origin) / scale
-    _cast(points, corners, neighbors, starts, around, sights.point, centers, sights.weight, sigma, options.behind,
-          crossed, ends)  # fmt: skip
-    _add_shape(points, corners, neighbors, options.beta, crossed)
+    raw = Delaunay(points)
+    _orient(points, raw.simplices, raw.neighbors)
+    cells = Cells(points, raw.simplices, raw.neighbors, *_find_around(raw.simplices, len(points)))
+    crossed, ends = np.zeros(cells.corners.shape, np.float32), np.zeros(len(cells.corners), np.float32)
+    sight = Sights(sights.point, (sights.center - origin) / scale, sights.weight)
+    _cast(cells, sight, options.sigma * cloud.step / scale, options.behind, crossed, ends)
+    _add_shape(cells, options.beta, crossed)
     capacity = np.rint(np.minimum(UNIT * crossed, 2.0**30)).astype(np.int32)
-    full = sink_side(neighbors, capacity, np.rint(UNIT * ends).astype(np.int64))
-    faces, vertices = _extract(corners, neighbors, full)
+    full = sink_side(cells.neighbors, capacity, np.rint(UNIT * ends).astype(np.int64))
+    faces, vertices = _extract(cells, full)
     return Surface(cloud.points[vertices], faces, cloud.colors[vertices]), cloud.step[vertices]
 
 
@@ -168,34 +184,38 @@ def _face_normal(points: FloatArray, corners: NDArray[np.int32], t: int, k: int,
 
 
 @kernel
-def _cast(  # noqa: PLR0913
-    points: FloatArray, corners: NDArray[np.int32], neighbors: NDArray[np.int32], starts: IndexArray,
-    around: NDArray[np.int32], seen: IndexArray, centers: FloatArray, weights: NDArray[np.float32], sigma: FloatArray,
-    behind: float, crossed: NDArray[np.float32], ends: NDArray[np.float32],
+def _cast(
+    cells: Cells, sights: Sights, sigma: FloatArray, behind: float, crossed: NDArray[np.float32],
+    ends: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Add the lines of sight: `crossed` (T, 4) from each tetrahedron to its neighbors, in the direction of sight;
-    `ends` (T,) those that begin in it less those that end."""
+    """Add the lines of sight; `sigma` (N,) is the uncertainty of the points.
+
+    `crossed` (T, 4) has those from a tetrahedron to its neighbors, in the direction of sight, and `ends` (T,) those that
+    begin in it less those that end.
+    """
     d, n = np.empty(3), np.empty(3)
-    for line in range(len(seen)):
-        v, weight = seen[line], weights[line]
+    for line in range(len(sights.point)):
+        v, weight = sights.point[line], sights.weight[line]
         for c in range(3):
-            d[c] = centers[line, c] - points[v, c]
+            d[c] = sights.center[line, c] - cells.points[v, c]
         distance = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
         d /= distance
-        _walk(points, corners, neighbors, starts, around, v, d, n, distance, sigma[v], weight, True, crossed, ends)
+        _walk(cells, v, d, n, distance, sigma[v], weight, crossed, ends)
         d *= -1.0
-        reach = behind * sigma[v]
-        _walk(points, corners, neighbors, starts, around, v, d, n, reach, sigma[v], weight, False, crossed, ends)
+        _walk(cells, v, d, n, behind * sigma[v], sigma[v], -weight, crossed, ends)
 
 
 @inlined_kernel
 def _walk(  # noqa: PLR0913
-    points: FloatArray, corners: NDArray[np.int32], neighbors: NDArray[np.int32], starts: IndexArray,
-    around: NDArray[np.int32], v: int, d: FloatArray, n: FloatArray, reach: float, sigma: float, weight: float,
-    is_before: bool, crossed: NDArray[np.float32], ends: NDArray[np.float32],
+    cells: Cells, v: int, d: FloatArray, n: FloatArray, reach: float, sigma: float, weight: float,
+    crossed: NDArray[np.float32], ends: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Follow a line from a point, with unit direction d; close to the point, its faces count less."""
-    t, came, gone = _first(points, corners, starts, around, v, d, n), -1, 0.0
+    """Follow a line from a point in the direction d, towards the photo, or away where the weight is negative.
+
+    Close to the point, faces count less.
+    """
+    points, corners, neighbors = cells.points, cells.corners, cells.neighbors
+    t, came, gone = _first(cells, v, d, n), -1, 0.0
     for _ in range(len(corners) if t >= 0 else 0):
         leave, farther = -1, np.inf
         for k in range(4):
@@ -212,33 +232,29 @@ def _walk(  # noqa: PLR0913
                 leave, farther = k, height / slope
         if leave < 0:
             return
-        gone = max(gone, farther)
-        after = neighbors[t, leave]
+        gone, after = max(gone, farther), neighbors[t, leave]
         if gone >= reach or after < 0:
-            ends[t] += weight if is_before else -weight
+            ends[t] += weight
             return
-        share = weight * (1.0 - np.exp(-0.5 * (gone / sigma) ** 2))
-        if is_before:
+        share = abs(weight) * (1.0 - np.exp(-0.5 * (gone / sigma) ** 2))
+        if weight < 0.0:
+            crossed[t, leave] += share
+        else:
             for k in range(4):
                 if neighbors[after, k] == t:
                     crossed[after, k] += share
-        else:
-            crossed[t, leave] += share
         came, t = t, after
 
 
 @inlined_kernel
-def _first(
-    points: FloatArray, corners: NDArray[np.int32], starts: IndexArray, around: NDArray[np.int32], v: int,
-    d: FloatArray, n: FloatArray,
-) -> int:  # fmt: skip
+def _first(cells: Cells, v: int, d: FloatArray, n: FloatArray) -> int:
     """Return the tetrahedron that a direction enters from a point, -1 where it leaves the hull."""
     best, least = -1, 1e-7
-    for at in range(starts[v], starts[v + 1]):
-        t, most = around[at], -np.inf
+    for at in range(cells.starts[v], cells.starts[v + 1]):
+        t, most = cells.around[at], -np.inf
         for k in range(4):
-            if corners[t, k] != v:
-                _face_normal(points, corners, t, k, n)
+            if cells.corners[t, k] != v:
+                _face_normal(cells.points, cells.corners, t, k, n)
                 slope = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
                 most = max(most, slope / np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2] + 1e-300))
         if most < least:
@@ -247,14 +263,12 @@ def _first(
 
 
 @kernel
-def _add_shape(
-    points: FloatArray, corners: NDArray[np.int32], neighbors: NDArray[np.int32], beta: float,
-    crossed: NDArray[np.float32],
-) -> None:  # fmt: skip
-    """Add to each face what it costs: nothing within a dense surface, up to 2 beta where its circumspheres are large.
+def _add_shape(cells: Cells, beta: float, crossed: NDArray[np.float32]) -> None:
+    """Add to each face up to 2 beta by one less the smaller cosine of its angles with the circumspheres at both sides.
 
-    It is one less the smaller cosine of its angles with the two circumspheres (Labatut 2009).
+    It is small within a dense surface, and large across space (Labatut 2009).
     """
+    points, corners, neighbors = cells.points, cells.corners, cells.neighbors
     center, radius, n = np.empty((len(corners), 3)), np.empty(len(corners)), np.empty(3)
     for t in range(len(corners)):
         _circumsphere(points, corners, t, center, radius)
@@ -277,25 +291,24 @@ def _add_shape(
 def _circumsphere(
     points: FloatArray, corners: NDArray[np.int32], t: int, center: FloatArray, radius: FloatArray
 ) -> None:
+    """Fill in the center and radius; of edges p, q, r it is (|p|^2 q x r + |q|^2 r x p + |r|^2 p x q) / (2 p . q x r)."""
     a, b, c, d = corners[t]
     px, py, pz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
     qx, qy, qz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
     rx, ry, rz = points[d, 0] - points[a, 0], points[d, 1] - points[a, 1], points[d, 2] - points[a, 2]
     pp, qq, rr = px * px + py * py + pz * pz, qx * qx + qy * qy + qz * qz, rx * rx + ry * ry + rz * rz
-    # x = (|p|^2 q x r + |q|^2 r x p + |r|^2 p x q) / (2 p . (q x r))
     ax, ay, az = qy * rz - qz * ry, qz * rx - qx * rz, qx * ry - qy * rx
     bx, by, bz = ry * pz - rz * py, rz * px - rx * pz, rx * py - ry * px
     cx, cy, cz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
-    half = 2.0 * (px * ax + py * ay + pz * az)
-    half = half if abs(half) > 1e-300 else 1e-300
-    x, y, z = pp * ax + qq * bx + rr * cx, pp * ay + qq * by + rr * cy, pp * az + qq * bz + rr * cz
-    center[t, 0], center[t, 1], center[t, 2] = points[a, 0] + x / half, points[a, 1] + y / half, points[a, 2] + z / half
-    radius[t] = max(np.sqrt(x * x + y * y + z * z) / abs(half), 1e-300)
+    whole = 2.0 * (px * ax + py * ay + pz * az)
+    whole = whole if abs(whole) > 1e-300 else 1e-300
+    x, y, z = (pp * ax + qq * bx + rr * cx), (pp * ay + qq * by + rr * cy), (pp * az + qq * bz + rr * cz)
+    x, y, z = x / whole, y / whole, z / whole
+    center[t, 0], center[t, 1], center[t, 2] = points[a, 0] + x, points[a, 1] + y, points[a, 2] + z
+    radius[t] = max(np.sqrt(x * x + y * y + z * z), 1e-300)
 
 
-def _extract(
-    corners: NDArray[np.int32], neighbors: NDArray[np.int32], full: NDArray[np.bool_]
-) -> tuple[IndexArray, IndexArray]:
+def _extract(cells: Cells, full: NDArray[np.bool_]) -> tuple[IndexArray, IndexArray]:
     """Return the faces (F, 3) between full and free tetrahedra, outwards, and (V,) the point of each vertex.
 
     Triangles around an edge belong together by the full tetrahedra between them: parts of the surface that only touch
@@ -304,33 +317,31 @@ def _extract(
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    t, k = np.nonzero(full[:, None] & (neighbors >= 0) & ~full[np.maximum(neighbors, 0)])
-    number = np.full((len(corners), 4), -1, np.int32)
+    t, k = np.nonzero(full[:, None] & (cells.neighbors >= 0) & ~full[np.maximum(cells.neighbors, 0)])
+    number, joined = np.full(cells.corners.shape, -1, np.int32), np.empty((6 * len(t), 2), np.int64)
     number[t, k] = np.arange(len(t))
-    joined = np.empty((6 * len(t), 2), np.int64)
-    count = _join_corners(corners, neighbors, full, number, t, k, joined)
-    one, other = joined[:count].T
-    graph = coo_array((np.ones(count, np.bool_), (one, other)), (3 * len(t), 3 * len(t)))
+    one, other = joined[: _join_corners(cells, full, number, t, k, joined)].T
+    graph = coo_array((np.ones(len(one), np.bool_), (one, other)), (3 * len(t), 3 * len(t)))
     _, vertex = connected_components(graph, directed=False)
-    at = np.take_along_axis(corners[t], FACES[k], axis=1)
     points = np.empty(int(vertex.max(initial=-1)) + 1, np.int64)
-    points[vertex] = at.ravel()
+    points[vertex] = np.take_along_axis(cells.corners[t], FACES[k], axis=1).ravel()
     return vertex.reshape(-1, 3).astype(np.int64), points
 
 
 @kernel
 def _join_corners(
-    corners: NDArray[np.int32], neighbors: NDArray[np.int32], full: NDArray[np.bool_], number: NDArray[np.int32],
-    tetrahedra: IndexArray, sides: IndexArray, joined: IndexArray,
+    cells: Cells, full: NDArray[np.bool_], number: NDArray[np.int32], tetrahedra: IndexArray, sides: IndexArray,
+    joined: IndexArray,
 ) -> int:  # fmt: skip
     """Fill in pairs of corners (3 f + i) of faces that are one vertex; return how many.
 
-    From each edge of a face, the way leads around the edge through full tetrahedra to the next face.
+    From each edge of a face, the way leads around the edge through full tetrahedra to the next face. `number` (T, 4) has
+    the number of each face; face f is opposite to corner `sides[f]` of `tetrahedra[f]`.
     """
-    count = 0
+    corners, neighbors, count = cells.corners, cells.neighbors, 0
     for f in range(len(tetrahedra)):
         for i in range(3):
-            t, inner = tetrahedra[f], sides[f]  # `inner` faces the free side, and lies opposite to the face
+            t, inner = tetrahedra[f], sides[f]
             first, second = corners[t, FACES[inner, i]], corners[t, FACES[inner, (i + 1) % 3]]
             opposite = FACES[inner, (i + 2) % 3]  # the next face around the edge lies opposite to the third corner
             while neighbors[t, opposite] >= 0 and full[neighbors[t, opposite]]:

@@ -1,9 +1,4 @@
-"""Visibility of points in photos by their depth maps, and their colors there.
-
-SciPy is imported where it is used: a program that only estimates fundamental matrices starts without it.
-"""
-
-from dataclasses import dataclass
+"""Visibility of points in photos by their depth maps."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +7,7 @@ from sfm_app.jit import kernel
 from sfm_app.types import PosedPhoto
 from sfm_app.types.arrays import DepthArray, FloatArray
 
-NO_EVIDENCE, CONFIRMED, SEEN_THROUGH, EMPTY = range(4)
+NO_EVIDENCE, CONFIRMED, SEEN_THROUGH = range(3)
 SKY = -2.0
 """Depth of a pixel that shows the sky; COLMAP's fusion reads it as no depth."""
 THROUGH = 3.0
@@ -22,11 +17,10 @@ THROUGH = 3.0
 def judge(
     points: FloatArray, normals: FloatArray, photo: PosedPhoto, depth: DepthArray, sample_px: float, tolerance: float
 ) -> NDArray[np.uint8]:
-    """Judge points on a surface: CONFIRMED, SEEN_THROUGH, EMPTY or NO_EVIDENCE.
+    """Judge points on a surface: CONFIRMED, SEEN_THROUGH or NO_EVIDENCE.
 
     A point is CONFIRMED if it faces the photo and the surrounding depths agree with its own within the relative
-    tolerance. It is SEEN_THROUGH if its pixel shows the sky, or if all four surrounding depths lie well behind it. It
-    is EMPTY if it faces the photo and no depth around it is known. Hidden and masked points give NO_EVIDENCE.
+    tolerance. It is SEEN_THROUGH if its pixel shows the sky, or if all four surrounding depths lie well behind it.
 
     The normals (N, 3) are unit vectors; the tolerance is a relative difference in depth. The depth map has SKY where
     the photo shows the sky, and other negative values where it is masked; `sample_px` is the position of a depth in its
@@ -57,85 +51,26 @@ def _judge(
         if depth[int(np.floor(v + 0.5)), int(np.floor(u + 0.5))] == SKY:
             verdict[k] = SEEN_THROUGH
             continue
-        low, known, masked, agrees = _surrounding(depth, row, col, z, tolerance)
-        if known == 0 and masked > 0:
-            continue
-        if agrees or known == 0:
+        low, known, agrees = _surrounding(depth, row, col, z, tolerance)
+        if agrees:
             x, y, w = center[0] - X, center[1] - Y, center[2] - Z
             facing = normals[k, 0] * x + normals[k, 1] * y + normals[k, 2] * w
             if facing > 0.1 * np.sqrt(x * x + y * y + w * w):
-                verdict[k] = EMPTY if known == 0 else CONFIRMED
+                verdict[k] = CONFIRMED
         elif known == 4 and low > (1.0 + THROUGH * tolerance) * z:
             verdict[k] = SEEN_THROUGH
 
 
 @kernel
-def _surrounding(depth: DepthArray, row: int, col: int, z: float, tolerance: float) -> tuple[float, int, int, bool]:
-    """Return the least of four depths, the numbers of known and masked ones, and whether they agree with z."""
-    low, high, known, masked, near = np.inf, 0.0, 0, 0, False
+def _surrounding(depth: DepthArray, row: int, col: int, z: float, tolerance: float) -> tuple[float, int, bool]:
+    """Return the least of four depths, the number of known ones, and whether they agree with z."""
+    low, high, known, near = np.inf, 0.0, 0, False
     for i in range(row, row + 2):
         for j in range(col, col + 2):
             d = depth[i, j]
             if d > 0:
                 low, high, known = min(low, d), max(high, d), known + 1
                 near = near or abs(d - z) <= tolerance * z
-            masked += d < 0
     # on a slope the four depths bracket the point's; across a step they are of different surfaces
     between = low <= z <= high and high - low <= 2.0 * THROUGH * tolerance * z
-    return low, known, masked, near or between
-
-
-ColorImage = NDArray[np.uint8]
-"""(H, W, 3) RGB."""
-
-
-@dataclass(slots=True, eq=False)
-class Paint:
-    """Weighted sums of colors over photos, and the sums of their weights."""
-
-    total: NDArray[np.float32]
-    """(V, 3) weighted sum of the colors."""
-    weight: NDArray[np.float32]
-    """(V,)."""
-
-    @classmethod
-    def zeros(cls, count: int) -> "Paint":
-        """Make the zero sums of `count` vertices."""
-        return cls(np.zeros((count, 3), np.float32), np.zeros(count, np.float32))
-
-    def add(self, at: NDArray[np.int64], other: "Paint") -> None:
-        """Add the colors of another photo; at (N,) the vertices that it sampled, each once."""
-        self.total[at] += other.total
-        self.weight[at] += other.weight
-
-    def mean_colors(self, points: FloatArray) -> NDArray[np.uint8]:
-        """Return (V, 3) mean colors at vertices (V, 3); vertices without photo get the color of the nearest other."""
-        from scipy.spatial import cKDTree
-
-        mean = self.total / np.maximum(self.weight, np.finfo(np.float32).tiny)[:, None]
-        colors, shown = np.rint(mean).astype(np.uint8), self.weight > 0
-        if shown.any() and not shown.all():
-            colors[~shown] = colors[shown][cKDTree(points[shown]).query(points[~shown])[1]]
-        return colors
-
-
-def sample_colors(
-    points: FloatArray, normals: FloatArray, verdict: NDArray[np.uint8], photo: PosedPhoto, image: ColorImage
-) -> Paint:
-    """Sample colors of one photo at the points that it confirms; their weight is the area of a unit patch in pixels."""
-    (height, width), at = image.shape[:2], np.flatnonzero(verdict == CONFIRMED)
-    x, y, z = points[at].T
-    x, y, z = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in photo.projection)
-    u, v = x / z - 0.5, y / z - 0.5
-    shown = (u >= 0) & (u < width - 1) & (v >= 0) & (v < height - 1)
-    at, u, v, z = at[shown], u[shown], v[shown], z[shown]
-    ray = photo.center - points[at]
-    facing = (normals[at] * ray).sum(axis=1) / np.linalg.norm(ray, axis=1)
-    share = facing * photo.focal_px**2 / (z * z)
-    col, row = u.astype(np.int64), v.astype(np.int64)
-    right, down = (u - col)[:, None], (v - row)[:, None]
-    upper = image[row, col] * (1 - right) + image[row, col + 1] * right
-    lower = image[row + 1, col] * (1 - right) + image[row + 1, col + 1] * right
-    paint = Paint.zeros(len(points))
-    paint.total[at], paint.weight[at] = share[:, None] * (upper * (1 - down) + lower * down), share
-    return paint
+    return low, known, near or between

@@ -12,7 +12,7 @@ from sfm_app.colmap.surface import positions
 from sfm_app.geometry.triangles import select_faces, unique_edges
 from sfm_app.jit import kernel
 from sfm_app.meshing.ray_casting import Occluders
-from sfm_app.meshing.tetrahedra import OPTIONS, Cloud, Sights, cut_surface, thin
+from sfm_app.meshing.tetrahedra import OPTIONS, Cloud, choose_sights, cut_surface, thin
 from sfm_app.meshing.visibility import CONFIRMED, SEEN_THROUGH, SKY, judge
 from sfm_app.stereo import View
 from sfm_app.tasks import Spread
@@ -107,7 +107,7 @@ def span(
         return Surface(np.empty((0, 3)), np.empty((0, 3), np.int64), np.empty((0, 3), np.uint8)), witnesses
     number, cloud = np.cumsum(kept) - 1, cloud.select(kept)
     centers = np.stack([view.center for view in evidence.views])
-    sights = Sights.choose([number[seen[kept[seen]]] for seen, _ in judged], centers, len(cloud.points))
+    sights = choose_sights([number[seen[kept[seen]]] for seen, _ in judged], centers, len(cloud.points))
     surface, step = cut_surface(cloud, sights)
     return smooth(surface if close else drop_guesses(surface, step, evidence)), witnesses
 
