@@ -24,13 +24,13 @@ class CutOptions:
 
     spacing_px: float = 2.5
     """Distance of the points in pixels of the depth maps."""
-    sigma: float = 1.0
+    sigma: float = 0.3
     """Uncertainty of a point along a line of sight, in distances of the points."""
-    behind: float = 3.0
+    behind: float = 1.5
     """Standard deviations behind a point at which it is full."""
     beta: float = 1.0
     """Weight of the shape of the triangles, in lines of sight."""
-    lines: int = 4
+    lines: int = 2
     """Most lines of sight of a point; each stands for as many as there are."""
 
 

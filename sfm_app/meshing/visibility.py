@@ -7,7 +7,7 @@ from sfm_app.jit import kernel
 from sfm_app.types import PosedPhoto
 from sfm_app.types.arrays import DepthArray, FloatArray
 
-NO_EVIDENCE, CONFIRMED, SEEN_THROUGH = range(3)
+NO_EVIDENCE, CONFIRMED, SEEN_THROUGH, EMPTY = range(4)
 SKY = -2.0
 """Depth of a pixel that shows the sky; COLMAP's fusion reads it as no depth."""
 THROUGH = 3.0
@@ -17,10 +17,11 @@ THROUGH = 3.0
 def judge(
     points: FloatArray, normals: FloatArray, photo: PosedPhoto, depth: DepthArray, sample_px: float, tolerance: float
 ) -> NDArray[np.uint8]:
-    """Judge points on a surface: CONFIRMED, SEEN_THROUGH or NO_EVIDENCE.
+    """Judge points on a surface: CONFIRMED, SEEN_THROUGH, EMPTY or NO_EVIDENCE.
 
     A point is CONFIRMED if it faces the photo and the surrounding depths agree with its own within the relative
-    tolerance. It is SEEN_THROUGH if its pixel shows the sky, or if all four surrounding depths lie well behind it.
+    tolerance. It is SEEN_THROUGH if its pixel shows the sky, or if all four surrounding depths lie well behind it. It
+    is EMPTY if it faces the photo and no depth around it is known. Hidden and masked points give NO_EVIDENCE.
 
     The normals (N, 3) are unit vectors; the tolerance is a relative difference in depth. The depth map has SKY where
     the photo shows the sky, and other negative values where it is masked; `sample_px` is the position of a depth in its
@@ -51,26 +52,29 @@ def _judge(
         if depth[int(np.floor(v + 0.5)), int(np.floor(u + 0.5))] == SKY:
             verdict[k] = SEEN_THROUGH
             continue
-        low, known, agrees = _surrounding(depth, row, col, z, tolerance)
-        if agrees:
+        low, known, masked, agrees = _surrounding(depth, row, col, z, tolerance)
+        if known == 0 and masked > 0:
+            continue
+        if agrees or known == 0:
             x, y, w = center[0] - X, center[1] - Y, center[2] - Z
             facing = normals[k, 0] * x + normals[k, 1] * y + normals[k, 2] * w
             if facing > 0.1 * np.sqrt(x * x + y * y + w * w):
-                verdict[k] = CONFIRMED
+                verdict[k] = EMPTY if known == 0 else CONFIRMED
         elif known == 4 and low > (1.0 + THROUGH * tolerance) * z:
             verdict[k] = SEEN_THROUGH
 
 
 @kernel
-def _surrounding(depth: DepthArray, row: int, col: int, z: float, tolerance: float) -> tuple[float, int, bool]:
-    """Return the least of four depths, the number of known ones, and whether they agree with z."""
-    low, high, known, near = np.inf, 0.0, 0, False
+def _surrounding(depth: DepthArray, row: int, col: int, z: float, tolerance: float) -> tuple[float, int, int, bool]:
+    """Return the least of four depths, the numbers of known and masked ones, and whether they agree with z."""
+    low, high, known, masked, near = np.inf, 0.0, 0, 0, False
     for i in range(row, row + 2):
         for j in range(col, col + 2):
             d = depth[i, j]
             if d > 0:
                 low, high, known = min(low, d), max(high, d), known + 1
                 near = near or abs(d - z) <= tolerance * z
+            masked += d < 0
     # on a slope the four depths bracket the point's; across a step they are of different surfaces
     between = low <= z <= high and high - low <= 2.0 * THROUGH * tolerance * z
-    return low, known, near or between
+    return low, known, masked, near or between

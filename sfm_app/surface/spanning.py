@@ -1,6 +1,6 @@
 """The surface through fused points: what photos see is kept, and gaps are closed where they see nothing else."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,16 +11,22 @@ from sfm_app.colmap.dense import read_depth
 from sfm_app.colmap.surface import positions
 from sfm_app.geometry.triangles import select_faces, unique_edges
 from sfm_app.jit import kernel
-from sfm_app.meshing.ray_casting import Occluders
 from sfm_app.meshing.tetrahedra import OPTIONS, Cloud, choose_sights, cut_surface, thin
-from sfm_app.meshing.visibility import CONFIRMED, SEEN_THROUGH, SKY, judge
+from sfm_app.meshing.visibility import CONFIRMED, EMPTY, SEEN_THROUGH, judge
 from sfm_app.stereo import View
 from sfm_app.tasks import Spread
 from sfm_app.types import Surface
-from sfm_app.types.arrays import DepthArray, FloatArray, IndexArray
+from sfm_app.types.arrays import FloatArray, IndexArray
 
-GAP = 8.0
-"""Longest edge of a measured triangle, in distances of points: longer ones close a gap."""
+GAP = 4.0
+"""Longest edge of a measured triangle, in distances of points: longer ones close a gap. Chosen by hand."""
+NARROW = 20.0
+"""Width of a patch that is closed even where no photo looks at it, in distances of points. Chosen by hand."""
+LEAST_FACING = 0.25
+"""Least mean cosine at which photos look at a wider patch: along it, they would not see what is behind. Chosen by hand.
+"""
+MOST_AGAINST = 0.1
+"""Largest share of a patch that photos see through. Chosen by hand."""
 SMOOTHING = 3
 """Steps of smoothing: the cut passes through points with noise. Chosen by hand."""
 LEAST_CONFIRMED = 200
@@ -39,18 +45,14 @@ class Evidence:
     """Relative difference in depth within which a photo confirms a point."""
     spread: Spread = map
 
-    def depth(self, view: View) -> DepthArray:
-        """Return a depth map."""
-        return read_depth(self.dense_dir, view, "geometric")
+    def judge(self, points: FloatArray, normals: FloatArray) -> Iterable[NDArray[np.uint8]]:
+        """Return the verdict of each photo on points (N, 3) with unit normals (N, 3)."""
 
-    def judge(self, cloud: Cloud) -> list[tuple[IndexArray, IndexArray]]:
-        """Return for each photo the points that it confirms, and those that it sees through."""
+        def look(view: View) -> NDArray[np.uint8]:
+            depth = read_depth(self.dense_dir, view, "geometric")
+            return judge(points, normals, view, depth, view.sample_px, self.tolerance)
 
-        def look(view: View) -> tuple[IndexArray, IndexArray]:
-            verdict = judge(cloud.points, cloud.normals, view, self.depth(view), view.sample_px, self.tolerance)
-            return np.flatnonzero(verdict == CONFIRMED), np.flatnonzero(verdict == SEEN_THROUGH)
-
-        return list(self.spread(look, self.views))
+        return self.spread(look, self.views)
 
 
 def gather(records: NDArray[np.void], views: Sequence[View]) -> Cloud:
@@ -92,76 +94,79 @@ def span(
     own = len(cloud.points)
     if context is not None:
         cloud = Cloud(*(np.concatenate([getattr(one, name) for one in (cloud, context)]) for name in Cloud.__slots__))
-    judged = evidence.judge(cloud)
+    seen, confirmed, through = list[IndexArray](), np.zeros(len(cloud.points)), np.zeros(len(cloud.points))
+    for verdict in evidence.judge(cloud.points, cloud.normals):
+        confirmed += verdict == CONFIRMED
+        through += verdict == SEEN_THROUGH
+        seen.append(np.flatnonzero(verdict == CONFIRMED))
     witnesses = [
         view
-        for view, (seen, _) in zip(evidence.views, judged, strict=True)
-        if np.count_nonzero(seen < own) >= LEAST_CONFIRMED
+        for view, at in zip(evidence.views, seen, strict=True)
+        if np.count_nonzero(at < own) >= LEAST_CONFIRMED
     ]
-    for_it, against = np.zeros(len(cloud.points), np.int64), np.zeros(len(cloud.points), np.int64)
-    for seen, through in judged:
-        for_it[seen] += 1
-        against[through] += 1
-    kept = (for_it > 0) & (against <= for_it)
+    kept = (confirmed > 0) & (through <= confirmed)
     if np.count_nonzero(kept) < 5:
         return Surface(np.empty((0, 3)), np.empty((0, 3), np.int64), np.empty((0, 3), np.uint8)), witnesses
     number, cloud = np.cumsum(kept) - 1, cloud.select(kept)
     centers = np.stack([view.center for view in evidence.views])
-    sights = choose_sights([number[seen[kept[seen]]] for seen, _ in judged], centers, len(cloud.points))
+    sights = choose_sights([number[at[kept[at]]] for at in seen], centers, len(cloud.points))
     surface, step = cut_surface(cloud, sights)
     return smooth(surface if close else drop_guesses(surface, step, evidence)), witnesses
 
 
 def drop_guesses(surface: Surface, step: FloatArray, evidence: Evidence) -> Surface:
-    """Drop triangles that are longer than the gaps of points, except where they close a hole that photos look at.
+    """Drop triangles that are longer than the gaps of points, except patches over holes that photos do not contradict.
 
-    `step` (V,) is the distance of the points at each vertex. A group of such triangles stays if measured ones surround
-    it, and photos show a part of it that is no sky.
+    `step` (V,) is the distance of the points at each vertex. Measured triangles surround such a patch, and hardly any
+    photo sees through it; it is narrow, or photos look at it and not along it.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     edges, edge_of = unique_edges(surface.faces)
     lengths = np.linalg.norm(surface.vertices[edges[:, 0]] - surface.vertices[edges[:, 1]], axis=1)
-    is_guess = lengths[edge_of].max(axis=1) > GAP * step[surface.faces].min(axis=1)
-    guesses = np.flatnonzero(is_guess)
-    sides = edge_of[guesses].ravel()
-    order = np.argsort(sides, kind="stable")
-    same = np.flatnonzero(sides[order][1:] == sides[order][:-1])
-    one, other = order[same] // 3, order[same + 1] // 3
-    size = len(guesses)
-    count, patch = connected_components(coo_array((np.ones(len(one)), (one, other)), (size, size)), directed=False)
-    at_end = (np.bincount(edge_of.ravel(), minlength=len(edges))[edge_of[guesses]] == 1).any(axis=1)
-    ends = np.bincount(patch, at_end, count) > 0
-    looked_at, area = look_at(surface, guesses, evidence)
-    share = np.bincount(patch, area * looked_at, count) / np.maximum(np.bincount(patch, area, count), 1e-300)
-    keep = ~is_guess
-    keep[guesses] = ((share > LEAST_SEEN) & ~ends)[patch]
+    steps = step[surface.faces].min(axis=1)
+    guesses = np.flatnonzero(lengths[edge_of].max(axis=1) > GAP * steps)
+    sides = edge_of[guesses]
+    order = np.argsort(sides.ravel(), kind="stable")
+    same = np.flatnonzero(np.diff(sides.ravel()[order]) == 0)
+    graph = coo_array((np.ones(len(same)), (order[same] // 3, order[same + 1] // 3)), (len(guesses), len(guesses)))
+    count, patch = connected_components(graph, directed=False)
+
+    def sum_up(values: NDArray[np.generic]) -> FloatArray:
+        return np.bincount(patch, values, count)
+
+    uses, inner = np.bincount(edge_of.ravel(), minlength=len(edges)), np.bincount(sides.ravel(), minlength=len(edges))
+    rim = sum_up((lengths[sides] * (inner[sides] == 1)).sum(axis=1))
+    is_closed = sum_up((uses[sides] == 1).any(axis=1)) == 0
+    corners = surface.vertices[surface.faces[guesses]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(normals, axis=1)
+    facing, against = _ask_photos(corners.mean(axis=1), normals / np.maximum(size, 1e-300)[:, None], evidence)
+    area = np.maximum(sum_up(size), 1e-300)
+    is_narrow = area <= NARROW * rim * sum_up(steps[guesses]) / np.maximum(sum_up(np.ones(len(guesses))), 1.0)
+    is_whole = is_closed & (sum_up(size * against) <= MOST_AGAINST * area)
+    keep = np.ones(len(surface.faces), np.bool_)
+    keep[guesses] = (is_whole & (is_narrow | (sum_up(size * facing) >= LEAST_FACING * area)))[patch]
     return select_faces(surface, keep)
 
 
-def look_at(surface: Surface, faces: IndexArray, evidence: Evidence) -> tuple[NDArray[np.bool_], FloatArray]:
-    """Return (N,) whether a photo shows the middle of triangles, most of them no sky there, and (N,) their areas."""
-    corners = surface.vertices[surface.faces[faces]]
-    middle, normal = corners.mean(axis=1), np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = 0.5 * np.linalg.norm(normal, axis=1)
-    seen, sky = np.zeros(len(faces), np.int64), np.zeros(len(faces), np.int64)
-    occluders = Occluders(surface.vertices, surface.faces)
-    for view in evidence.views:
-        ray = view.center - middle
-        x, y, z = (middle @ view.projection[:, :3].T + view.projection[:, 3]).T
-        shown = (z > 0) & (x >= 0) & (y >= 0) & (x < view.width * z) & (y < view.height * z)
-        shown &= (normal * ray).sum(axis=1) > 0.0
-        at = np.flatnonzero(shown)
-        slack = 1e-4 * float(np.linalg.norm(ray[at], axis=1).min(initial=np.inf))
-        at = at[~occluders.is_hidden(view.center, slack, middle[at])] if len(at) else at
-        depth = evidence.depth(view)
-        rows, columns = depth.shape
-        row = np.minimum((y[at] / z[at] * rows / view.height).astype(np.int64), rows - 1)
-        column = np.minimum((x[at] / z[at] * columns / view.width).astype(np.int64), columns - 1)
-        seen[at] += 1
-        sky[at] += depth[row, column] == SKY
-    return (seen > 0) & (2 * sky <= seen), area
+def _ask_photos(
+    points: FloatArray, normals: FloatArray, evidence: Evidence
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return (N,) the largest cosine between the normal and the direction to a photo that shows nothing else there.
+
+    Also return (N,) whether more photos see through the point. Points (N, 3) and unit normals (N, 3).
+    """
+    facing, looks = np.zeros(len(points)), np.zeros(len(points), np.int64)
+    for view, verdict in zip(evidence.views, evidence.judge(points, normals), strict=True):
+        ray = view.center - points
+        cosine = (normals * ray).sum(axis=1) / np.linalg.norm(ray, axis=1)
+        agrees = (verdict == CONFIRMED) | (verdict == EMPTY)
+        facing[agrees] = np.maximum(facing[agrees], cosine[agrees])
+        looks += agrees
+        looks -= verdict == SEEN_THROUGH
+    return facing, looks < 0
 
 
 def smooth(surface: Surface) -> Surface:
