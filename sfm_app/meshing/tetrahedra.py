@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.triangles import number_vertices
 from sfm_app.jit import inlined_kernel, kernel
 from sfm_app.meshing.min_cut import sink_side
 from sfm_app.types import Surface
@@ -39,6 +40,10 @@ UNIT = 256.0
 """Capacity of one line of sight: integers have the same sum in any order."""
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 """Corners of the face opposite to each corner, counter-clockwise seen from outside."""
+
+
+FAR = 3.0 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+"""Corners of a tetrahedron around all points, in extents of these."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,11 +128,12 @@ class Cells(NamedTuple):
 
 
 def cut_surface(cloud: Cloud, sights: Sights, options: CutOptions = OPTIONS) -> tuple[Surface, FloatArray]:
-    """Return the cut as an oriented manifold, closed except at the hull of all points, and (V,) the points' steps."""
+    """Return the cut as an oriented manifold, closed except far from all points, and (V,) the points' steps."""
     from scipy.spatial import Delaunay
 
     origin, scale = cloud.points.mean(axis=0), float(np.ptp(cloud.points, axis=0).max())
-    points = (cloud.points - origin) / scale
+    # tetrahedra behind every point, also on the convex hull
+    points = np.concatenate([(cloud.points - origin) / scale, FAR])
     raw = Delaunay(points)
     _orient(points, raw.simplices, raw.neighbors)
     cells = Cells(points, raw.simplices, raw.neighbors, *_find_around(raw.simplices, len(points)))
@@ -138,7 +144,9 @@ def cut_surface(cloud: Cloud, sights: Sights, options: CutOptions = OPTIONS) -> 
     capacity = np.rint(np.minimum(UNIT * crossed, 2.0**30)).astype(np.int32)
     full = sink_side(cells.neighbors, capacity, np.rint(UNIT * ends).astype(np.int64))
     faces, vertices = _extract(cells, full)
-    return Surface(cloud.points[vertices], faces, cloud.colors[vertices]), cloud.step[vertices]
+    used, faces = number_vertices(faces[(vertices[faces] < len(cloud.points)).all(axis=1)])
+    at = vertices[used]
+    return Surface(cloud.points[at], faces, cloud.colors[at]), cloud.step[at]
 
 
 @kernel
