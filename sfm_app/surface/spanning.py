@@ -23,7 +23,9 @@ GAP = 4.0
 NARROW = 20.0
 """Width of a patch that is closed even where no photo looks at it, in distances of points. Chosen by hand."""
 LEAST_FACING = 0.25
-"""Least cosine at which a photo looks at a triangle of a wider patch, and not along it. Chosen by hand."""
+"""Least mean cosine at which photos look at a wider patch, and not along it. Chosen by hand."""
+LEAST_LOOKED = 0.1
+"""Least share of it that they look at: the underside of a table has none. Chosen by hand."""
 MOST_AGAINST = 0.1
 """Largest share of a patch that photos see through. Chosen by hand."""
 SMOOTHING = 3
@@ -117,7 +119,7 @@ def drop_guesses(surface: Surface, step: FloatArray, evidence: Evidence) -> Surf
     """Drop triangles that are longer than the gaps of points, except patches over holes that photos do not contradict.
 
     `step` (V,) is the distance of the points at each vertex. Measured triangles surround such a patch, and hardly any
-    photo sees through it. Of a wide one, the triangles stay that photos look at, and not along.
+    photo sees through it; it is narrow, or photos look at a part of it and not along it.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -146,7 +148,9 @@ def drop_guesses(surface: Surface, step: FloatArray, evidence: Evidence) -> Surf
     is_narrow = area <= NARROW * rim * sum_up(steps[guesses]) / np.maximum(sum_up(np.ones(len(guesses))), 1.0)
     is_whole = is_closed & (sum_up(size * against) <= MOST_AGAINST * area)
     keep = np.ones(len(surface.faces), np.bool_)
-    keep[guesses] = is_whole[patch] & (is_narrow[patch] | ((facing >= LEAST_FACING) & ~against))
+    looked = sum_up(size * (facing > 0.0))
+    is_faced = (looked >= LEAST_LOOKED * area) & (sum_up(size * facing) >= LEAST_FACING * looked)
+    keep[guesses] = (is_whole & (is_narrow | is_faced))[patch]
     return select_faces(surface, keep)
 
 
