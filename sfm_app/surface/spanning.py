@@ -18,7 +18,7 @@ from sfm_app.tasks import Spread
 from sfm_app.types import Surface
 from sfm_app.types.arrays import FloatArray, IndexArray
 
-GAP = 4.0
+GAP = 8.0
 """Longest edge of a measured triangle, in distances of points: longer ones close a gap. Chosen by hand."""
 NARROW = 20.0
 """Width of a patch that is closed even where no photo looks at it, in distances of points. Chosen by hand."""
