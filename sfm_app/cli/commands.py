@@ -91,15 +91,15 @@ def _default_folder(photos: Path) -> Path:
 
 
 @click.command()
-@click.argument("photos", type=PATH)
+@click.argument("photos", type=PATH, nargs=-1, required=True)
 @click.option("-o", "--out", type=PATH, help="Keep features and matches in this folder.")
 @click.option(
     "--figure", type=PATH, help="Plot the pairs' votes, the lens curve and the residuals in this PNG, SVG or PDF file."
 )
 @settings_options
 @output_options
-def calibrate(photos: Path, out: Path | None, figure: Path | None, **flags: Any) -> None:
-    """Estimate the camera matrix of PHOTOS, a folder or a video, without reconstructing the scene."""
+def calibrate(photos: tuple[Path, ...], out: Path | None, figure: Path | None, **flags: Any) -> None:
+    """Estimate the camera matrix of PHOTOS, named as in `sfm-app run`, without reconstructing the scene."""
     from sfm_app.cli.terminal import Terminal
     from sfm_app.report.text import intrinsics_lines, intrinsics_summary
 

@@ -177,12 +177,21 @@ def distance_text(distance: Distance) -> str:
 def result_lines(intrinsics: Intrinsics | None, scene: Scene | None, stages: Mapping[str, Any]) -> list[str]:
     """Return cameras, scene and size as lines of text; `stages` are the records of the manifest."""
     counts = {name: stage["counts"] for name, stage in stages.items()}
-    lines = intrinsics_lines(intrinsics) if intrinsics is not None else []
+    lines = [f"            {WARNING}{text}" for text in input_warnings(counts.get("photos", {}))]
+    lines += intrinsics_lines(intrinsics) if intrinsics is not None else []
     for stage in ("view_graph", "intrinsics"):
         lines += [f"            {text}" for text in contradiction_lines(counts.get(stage, {}))]
     if scene is not None:
         lines += scene_lines(scene, counts.get("scene", {}))
     return [*lines, *scale_lines(counts["scale"])] if "scale" in counts else lines
+
+
+def input_warnings(counts: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what masks and positions are of no use, from the figures of the stage `photos`."""
+    masks = counts.get("masks", {})
+    useless = {"masks hide nothing": masks.get("white"), "masks belong to no photo": masks.get("unused")}
+    useless |= {f"{file} names photos that are not there": names for file, names in counts.get("missing", {}).items()}
+    yield from (f"{what}: {list_names(names, NAMES_SHOWN)}" for what, names in useless.items() if names)
 
 
 # Summaries of a run's scene: lines of text, and plain values for --json.

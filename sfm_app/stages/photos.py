@@ -257,7 +257,7 @@ def _read_photos(
     write_photo_list(photo_set, copies, run.workspace)
     run.record(usable=len(photos), cameras=len(photo_set.groups), unusable={p.name: p.reason for p in unusable})
     run.record(notes={photo.label: list(photo.notes) for photo in photos if photo.notes})
-    run.record(gps=sum(photo.gps is not None for photo in timed))
+    run.record(gps=sum(photo.gps is not None for photo in timed), missing=dict(source.missing))
     return photo_set
 
 
