@@ -33,7 +33,10 @@ def map_incrementally(
         (scratch / name).mkdir(parents=True)
     start.write(scratch / "start")
     check_written(*(scratch / "start").iterdir())
-    seek_lens = options.ba_refine_focal_length and all(_has_unknown_lens(camera) for camera in all_cameras(start))
+    seek_lens = options.ba_refine_focal_length and all(
+        bool(camera.model.name == SQUARE_PIXELS and camera.params[camera.extra_params_idxs()[0]] == 0.0)
+        for camera in all_cameras(start)
+    )
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = seek_lens
     models = pycolmap.incremental_mapping(
         database, photo_dir, scratch / "grown", options,
@@ -110,11 +113,3 @@ def incremental_options(
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
     return options
-
-
-def _has_unknown_lens(camera: pycolmap.Camera) -> bool:
-    """Return whether mapping has to estimate the lens: a known one stays fixed until the last adjustment.
-
-    On the first few photos even one distortion term varies more than the noise explains, and four diverge.
-    """
-    return bool(camera.model.name == SQUARE_PIXELS and camera.params[camera.extra_params_idxs()[0]] == 0.0)

@@ -103,7 +103,17 @@ def orient(
         raise NumericalError("the frame of the viewer is not finite")
     with translate_errors("turning the model upright"):
         move(model, viewer)
-    entry = _orientation_entry(upright, front) | _georeference_entry(viewer, gps)
+    entry = {
+        "up": upright.method,
+        "up_deviation_deg": round(upright.deviation_deg, 3) if np.isfinite(upright.deviation_deg) else None,
+        "off_camera_roll_deg": round(upright.angle_to_roll_deg, 2),
+        "camera_roll_spread_deg": round(upright.roll.spread_deg, 2),
+        "photos_turned_deg": upright.roll.turn_deg,
+        "up_sign_odds": odds(upright.sign_log_odds),
+        "up_axis_odds": odds(upright.axis_log_odds),
+        "up_evidence_nats": {name: round(nats, 1) for name, nats in upright.evidence.items()},
+        "front": front,
+    } | _georeference_entry(viewer, gps)
     logger.info("orientation: %s", entry)
     return entry
 
@@ -160,20 +170,6 @@ def extract_cues(path: Path, turn_deg: int = 0) -> PhotoCues:
         return PhotoCues(np.zeros((0, 4)), None)
     gray = np.asarray(picture, np.uint8)
     return PhotoCues(line_segments(gray), np.rot90(shrink(gray, CUE_OPTIONS.picture_px), -turn_deg // 90))
-
-
-def _orientation_entry(upright: UpEstimate, front: str) -> dict[str, Json]:
-    return {
-        "up": upright.method,
-        "up_deviation_deg": round(upright.deviation_deg, 3) if np.isfinite(upright.deviation_deg) else None,
-        "off_camera_roll_deg": round(upright.angle_to_roll_deg, 2),
-        "camera_roll_spread_deg": round(upright.roll.spread_deg, 2),
-        "photos_turned_deg": upright.roll.turn_deg,
-        "up_sign_odds": odds(upright.sign_log_odds),
-        "up_axis_odds": odds(upright.axis_log_odds),
-        "up_evidence_nats": {name: round(nats, 1) for name, nats in upright.evidence.items()},
-        "front": front,
-    }
 
 
 def gps_deviation(orientation: Mapping[str, Json]) -> float | None:
