@@ -17,13 +17,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from sfm_app.camera.models import PARAMETERS, calibration_from_model
 from sfm_app.errors import InputError
 from sfm_app.files import decode_text, fingerprint, read_bytes, read_text
 from sfm_app.numerical import finite_entries
 from sfm_app.types import Calibration, GivenCameras
+from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import GIVEN, PROJECTIONS
 
 Cameras = tuple[dict[str, Calibration], dict[str, str]]
@@ -251,7 +251,7 @@ def _value(values: Mapping[str, Any], names: Sequence[str]) -> Any:
     return next((plain[name] for name in names if plain.get(name) is not None), None)
 
 
-def _numbers(value: Any, what: str) -> NDArray[np.float64]:
+def _numbers(value: Any, what: str) -> FloatArray:
     """Return numbers from nested lists, or from a mapping with "data", as ROS and OpenCV write matrices."""
     if isinstance(value, Mapping):
         value = value.get("data")

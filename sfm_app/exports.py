@@ -42,6 +42,7 @@ from sfm_app.pipeline import MESH, SCALE, SCENE, TEXTURE
 from sfm_app.products import read_photo_list
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Model, Scene, SceneArrays
+from sfm_app.types.arrays import FloatArray
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
 from sfm_app.wording import list_names
 
@@ -110,7 +111,7 @@ def stored_arrays(run: RunContext) -> SceneArrays:
     return model_arrays(model, metric=stored_frame(run).is_metric)
 
 
-def stored_distance(run: RunContext, ends: NDArray[np.float64]) -> Distance:
+def stored_distance(run: RunContext, ends: FloatArray) -> Distance:
     """Return the distance between two places, (2, 3) in the frame of exports; ValueError if both are the same."""
     check_finished(run, [SCENE], "camera poses")
     frame = stored_frame(run)
@@ -145,7 +146,7 @@ def stored_cloud(run: RunContext) -> PointCloud:
     return PointCloud(points, colors, normals)
 
 
-def _columns(records: NDArray[np.void], names: Sequence[str]) -> NDArray[np.float64]:
+def _columns(records: NDArray[np.void], names: Sequence[str]) -> FloatArray:
     return np.stack([records[name] for name in names], axis=1).astype(np.float64)
 
 
@@ -308,10 +309,7 @@ def check_replaceable(target: Path) -> None:
 
 
 def check_parts(main: Path, parts: Sequence[str]) -> None:
-    """Check that the other files of a model are missing, or parts of an earlier export to `main`; InputError if not.
-
-    The user has only named the main file. An earlier one names its parts.
-    """
+    """Check that the other files of a model are missing, or parts of an earlier export to `main`; InputError if not."""
     present = [path for name in parts if (path := main.with_name(name)).exists()]
     named = b"".join(_beginning(path) for path in (main, *present) if path.is_file())
     foreign = [path.name for path in present if path.name.encode() not in named]

@@ -330,8 +330,5 @@ def convert_lens(params: FloatArray, family: int, reach: float) -> FloatArray | 
 
 
 def family_evidence(cost_px2: float, noise_px: float, best: LensChoice) -> float:
-    """Return the log-probability of a bundle with one of its cameras as it is, comparable between families.
-
-    The noise is the same for all candidates.
-    """
+    """Return the log-probability of a bundle with one of its cameras as it is, comparable between families."""
     return best.log_evidence - evidence_weight(noise_px) * cost_px2

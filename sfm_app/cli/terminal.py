@@ -29,10 +29,7 @@ INDENT = " " * 6
 
 
 class Terminal(Progress):
-    """Progress on stderr: a line per stage and a bar on a terminal, a few more lines elsewhere, nothing when quiet.
-
-    On a terminal the bar moves as long as a stage runs. Elsewhere, `check_silence` prints the title of a long stage.
-    """
+    """Progress on stderr: a line per stage and a bar on a terminal, a few more lines elsewhere, nothing when quiet."""
 
     def __init__(
         self, *, quiet: bool, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic

@@ -99,10 +99,7 @@ def translate_errors(doing: str) -> Iterator[None]:
 
 
 def _is_ours(err: Exception) -> bool:
-    """Return whether an error was raised by Python code other than our calls of COLMAP.
-
-    A traceback has no frames of pycolmap itself.
-    """
+    """Return whether an error was raised by Python code other than our calls of COLMAP."""
     if isinstance(err, np.linalg.LinAlgError | ArithmeticError):
         return True
     frames = [frame for frame, _ in traceback.walk_tb(err.__traceback__)]
@@ -122,10 +119,7 @@ def check_written(*files: Path) -> None:
 
 
 def run_in_daemon_thread(call: Callable[[], Result]) -> Result:
-    """Run a COLMAP call that cannot be stopped, so that Ctrl-C takes effect at once.
-
-    After Ctrl-C the call goes on in its daemon thread; see `has_running_call`.
-    """
+    """Run a COLMAP call that cannot be stopped, so that Ctrl-C takes effect at once."""
     future: Future[Result] = Future()
 
     def run() -> None:

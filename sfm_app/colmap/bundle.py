@@ -482,10 +482,7 @@ def _adjusted_names(rounds: Rounds, row: int) -> tuple[str, ...]:
 
 
 def apply_rules(model: pycolmap.Reconstruction, rules: Rules) -> None:
-    """Give cameras the user's values or model, in place, and adjust poses and points to them.
-
-    Mapping may have changed a camera that is kept, and may have used another model.
-    """
+    """Give cameras the user's values or model, in place, and adjust poses and points to them."""
     changed = False
     for camera_id, rule in rules.items():
         camera = model.cameras[camera_id]

@@ -67,10 +67,7 @@ def map_globally(
 def map_with_colmap_defaults(
     photo_dir: Path, scratch: Path, seed: int, token: CancellationToken
 ) -> pycolmap.Reconstruction | None:
-    """Verify the raw matches and map the photos by COLMAP's defaults, with the cameras of the database as first guess.
-
-    Only the raw matches and the guess are ours. Result and errors are those of `map_globally`.
-    """
+    """Verify the raw matches and map the photos by COLMAP's defaults, with the cameras of the database as first guess."""
     call = partial(tasks.map_with_defaults, scratch, photo_dir, seed)
     return _map_in_process(call, scratch, "mapping photos by its defaults", token)
 

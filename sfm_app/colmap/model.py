@@ -17,9 +17,10 @@ from sfm_app.geometry.epipolar import TwoViewSeed
 from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import finite_entries
 from sfm_app.types import CameraModel, Model, PairId, PosedPhoto, Scene, SceneArrays, Surface
+from sfm_app.types.arrays import BoolArray, ByteArray, FloatArray, IndexArray
 
 
-def finite_mask(xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
+def finite_mask(xyz: FloatArray) -> BoolArray:
     """Return (...) which points (..., 3) are finite, and near enough that squares do not overflow."""
     return np.asarray((np.abs(xyz) < 1e100).all(axis=-1))
 
@@ -61,14 +62,14 @@ def model_from_seed(
 class PlacedView:
     """A posed photo and the bearing vectors of its keypoints."""
 
-    R: NDArray[np.float64]
-    t: NDArray[np.float64]
+    R: FloatArray
+    t: FloatArray
     """(3, 3) rotation and (3,) translation, camera from world."""
-    lines: NDArray[np.float64]
+    lines: FloatArray
     """(N, 9) bearing vectors of keypoints, see `camera.bearings`."""
 
 
-def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray[np.float64]]) -> dict[int, PlacedView]:
+def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, FloatArray]) -> dict[int, PlacedView]:
     """Return all photos of a model that have a pose, by id; keypoints are (N, 2) pixels."""
     views = {}
     for image in posed_images(model):
@@ -83,12 +84,12 @@ def camera_family(camera: pycolmap.Camera) -> int:
     return FAMILIES[projection_of_model(camera.model.name)]
 
 
-def read_camera(camera: pycolmap.Camera) -> NDArray[np.float64]:
+def read_camera(camera: pycolmap.Camera) -> FloatArray:
     """Return the parameters (12,) of a camera, as in `camera.projection`."""
     return row_of_model(camera.model.name, camera.params)
 
 
-def bearing_vectors(camera: pycolmap.Camera, x: NDArray[np.float64]) -> NDArray[np.float64]:
+def bearing_vectors(camera: pycolmap.Camera, x: FloatArray) -> FloatArray:
     """Return bearing vectors (N, 9) of pixels (N, 2), as `camera.bearings` does."""
     if camera_family(camera) != PERSPECTIVE:
         # step of the derivatives: curvature and rounding in double precision cost about 1e-9 of them
@@ -107,12 +108,12 @@ def posed_photo_ids(model: pycolmap.Reconstruction) -> list[int]:
     return [image.image_id for image in posed_images(model)]
 
 
-def cameras_by_photo(model: pycolmap.Reconstruction) -> dict[int, tuple[NDArray[np.float64], tuple[float, ...]]]:
+def cameras_by_photo(model: pycolmap.Reconstruction) -> dict[int, tuple[FloatArray, tuple[float, ...]]]:
     """Return K (3, 3) and `Calibration.distortion` of every posed photo, by id: k1; of a fisheye, all radial terms."""
     return {image.image_id: _matrix_and_terms(model.cameras[image.camera_id]) for image in posed_images(model)}
 
 
-def _matrix_and_terms(camera: pycolmap.Camera) -> tuple[NDArray[np.float64], tuple[float, ...]]:
+def _matrix_and_terms(camera: pycolmap.Camera) -> tuple[FloatArray, tuple[float, ...]]:
     k1, k2, _, _, k3, k4, *_ = read_camera(camera)[K1:].tolist()
     is_fisheye = camera_family(camera) == FISHEYE
     return scale_matrix(camera), (k1, k2, 0.0, 0.0, k3, k4) if is_fisheye else (k1,)
@@ -144,7 +145,7 @@ def posed_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     return sorted((image for image in all_images(model) if image.has_pose), key=lambda image: image.image_id)
 
 
-def poses_and_points(model: pycolmap.Reconstruction) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.float64]]:
+def poses_and_points(model: pycolmap.Reconstruction) -> tuple[dict[int, FloatArray], FloatArray]:
     """Return (3, 4) cam_from_world of the posed photos by id, in order of ids, and the points (P, 3)."""
     poses = {image.image_id: np.asarray(image.cam_from_world().matrix(), np.float64) for image in posed_images(model)}
     points = np.array([model.points3D[key].xyz for key in sorted(model.points3D)]).reshape(-1, 3)
@@ -156,7 +157,7 @@ def finite_points(model: pycolmap.Reconstruction) -> list[pycolmap.Point3D]:
     return [model.points3D[key] for key in sorted(model.points3D) if finite_mask(model.points3D[key].xyz)]
 
 
-def point_arrays(points: Sequence[pycolmap.Point3D]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def point_arrays(points: Sequence[pycolmap.Point3D]) -> tuple[FloatArray, ByteArray]:
     """Return positions (P, 3) and colors (P, 3) of points."""
     xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     return xyz, np.array([point.color for point in points], np.uint8).reshape(-1, 3)
@@ -166,11 +167,11 @@ def point_arrays(points: Sequence[pycolmap.Point3D]) -> tuple[NDArray[np.float64
 class SeenPoints:
     """Points of a model, and the photos that see them."""
 
-    points: NDArray[np.float64]
+    points: FloatArray
     """(P, 3)"""
-    colors: NDArray[np.uint8]
+    colors: ByteArray
     """(P, 3)"""
-    seen: tuple[NDArray[np.int64], ...]
+    seen: tuple[IndexArray, ...]
     """For each posed photo, in order of ids, the rows of its points."""
 
 
@@ -185,12 +186,12 @@ def seen_points(model: pycolmap.Reconstruction, most: int) -> SeenPoints:
     return SeenPoints(*point_arrays(sample), tuple(np.array(own, np.int64) for own in rows.values()))
 
 
-def scale_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:
+def scale_matrix(camera: pycolmap.Camera) -> FloatArray:
     """Return K (3, 3) of a camera; of a panorama, the scale at its center."""
     return camera_matrix(*read_camera(camera)[:4].tolist())
 
 
-def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
+def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: FloatArray) -> FloatArray:
     """Return viewing directions (N, 3), of any length, of pixels (N, 2) of a posed photo, in the frame of the world."""
     image = model.images[image_id]
     R = image.cam_from_world().matrix()[:, :3]
@@ -331,9 +332,9 @@ class ModelFigures:
 
     photos: dict[str, PhotoObservations]
     """By name, of the posed photos."""
-    tracks: NDArray[np.int64]
+    tracks: IndexArray
     """(P,) number of photos that see each point."""
-    places: NDArray[np.float64]
+    places: FloatArray
     """(P, 3) the points."""
 
 
@@ -348,7 +349,7 @@ def model_figures(model_dir: Path) -> ModelFigures:
     return ModelFigures(photos, tracks, np.array([xyz[key] for key in keys]).reshape(-1, 3))
 
 
-def _observe(image: pycolmap.Image, camera: pycolmap.Camera, xyz: dict[int, NDArray[np.float64]]) -> PhotoObservations:
+def _observe(image: pycolmap.Image, camera: pycolmap.Camera, xyz: dict[int, FloatArray]) -> PhotoObservations:
     keypoints = image.get_observation_points2D()
     if not keypoints:
         return PhotoObservations(0, float("nan"), 0.0)

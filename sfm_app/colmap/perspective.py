@@ -9,7 +9,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.perspective_views import PerspectiveView, center_view
 from sfm_app.camera.rows import FX
@@ -29,7 +28,7 @@ from sfm_app.meshing.agreement import RefinePhoto
 from sfm_app.operating_system import replace_file
 from sfm_app.progress import Progress
 from sfm_app.stereo import View
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import Float32Array, FloatArray
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
 
 
@@ -47,16 +46,16 @@ class PixelMaps:
 
     def __init__(self, model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens]) -> None:
         self._model, self._lenses, self._lock = model, lenses, threading.Lock()
-        self._known: tuple[int, list[NDArray[np.float32]]] = (-1, [])
+        self._known: tuple[int, list[Float32Array]] = (-1, [])
 
-    def camera_maps(self, camera_id: int) -> list[NDArray[np.float32]]:
+    def camera_maps(self, camera_id: int) -> list[Float32Array]:
         """Return the pixels (H, W, 2) of each view, -1 where the photo does not show them."""
         with self._lock:
             if self._known[0] != camera_id:
                 self._known = camera_id, self._compute(camera_id)
             return self._known[1]
 
-    def _compute(self, camera_id: int) -> list[NDArray[np.float32]]:
+    def _compute(self, camera_id: int) -> list[Float32Array]:
         lens, camera = self._lenses[camera_id], self._model.cameras[camera_id]
 
         def project(rays: FloatArray) -> FloatArray:

@@ -6,7 +6,6 @@ A compensated keypoint is where a global shutter at the time of the middle row w
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.bundle.lens_parts import PARTS
 from sfm_app.bundle.normal_equations import Bundle
@@ -15,7 +14,7 @@ from sfm_app.camera.projection import image_points
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle import Adjustment, lens_priors, read_bundle, write_bundle
 from sfm_app.colmap.model import posed_images, viewing_rays
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import FloatArray, IndexArray
 
 Keypoints = Mapping[int, FloatArray]
 """(N, 2) pixels, by photo id."""
@@ -76,7 +75,7 @@ def row_shares(x: FloatArray, camera: pycolmap.Camera) -> FloatArray:
     return np.asarray(x[:, 0] / camera.width - 0.5 if upright else x[:, 1] / camera.height - 0.5, np.float64)
 
 
-def _tracked_rows(image: pycolmap.Image) -> NDArray[np.int64]:
+def _tracked_rows(image: pycolmap.Image) -> IndexArray:
     """Return the indices of the keypoints that have a point in space, in order."""
     return np.flatnonzero([keypoint.has_point3D() for keypoint in image.points2D])
 

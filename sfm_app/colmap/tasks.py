@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import check_written, largest_model, pycolmap, run_with_progress
 from sfm_app.colmap.worker_process import ProgressReporter
+from sfm_app.types.arrays import FloatArray
 
 JPEG_QUALITY = 98
 UNDISTORTED_PHOTOS = {"COLMAP": "images", "PMVS": "pmvs/visualize"}
@@ -23,10 +23,7 @@ def map_globally(scratch: Path, photo_dir: Path, seed: int, names: Sequence[str]
 
 
 def global_options(seed: int, names: Sequence[str]) -> pycolmap.GlobalPipelineOptions:
-    """Return COLMAP's defaults, except that it uses our relative poses unchanged and adjusts coarsely.
-
-    The last adjustment is ours.
-    """
+    """Return COLMAP's defaults, except that it uses our relative poses unchanged and adjusts coarsely."""
     options = pycolmap.GlobalPipelineOptions()
     options.image_names = list(names)
     options.min_model_size = 2
@@ -98,7 +95,7 @@ def undistort(
 # threads, and where cores are shared they are many times slower.
 
 
-def fuse(dense_dir: Path, min_views: int, box: NDArray[np.float64], target: Path, cache_gb: float) -> None:
+def fuse(dense_dir: Path, min_views: int, box: FloatArray, target: Path, cache_gb: float) -> None:
     """Fuse the depth maps of a dense workspace into points."""
     options = pycolmap.StereoFusionOptions()
     options.min_num_pixels = min_views

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.perspective_views import PerspectiveView, cover_rays
 from sfm_app.camera.projection import SEEN_ANGLE, image_points
@@ -18,7 +17,7 @@ from sfm_app.colmap.tasks import JPEG_QUALITY
 from sfm_app.files import replace_atomically
 from sfm_app.photos.masks import read_mask, save_mask
 from sfm_app.photos.panoramas import resample, shrink
-from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.types.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 
 ViewNames = Mapping[str, Sequence[str]]
 """Names of the views of each photo, by its name."""
@@ -139,8 +138,8 @@ def write_views(name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | Non
 
 
 def render_views(
-    name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | None, maps: Sequence[NDArray[np.float32]] = ()
-) -> Iterator[tuple[NDArray[np.uint8], BoolArray]]:
+    name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | None, maps: Sequence[Float32Array] = ()
+) -> Iterator[tuple[ByteArray, BoolArray]]:
     """Yield each view of a photo, (H, W, 3) BGR, and the mask (H, W) of pixels that it shows and nothing masks.
 
     `maps` (H, W, 2) are the pixels of the photo that each view shows, -1 where it shows none; empty if not known.
@@ -157,7 +156,7 @@ def render_views(
         yield resample(small, pixels, lens.size, wraps=lens.family == PANORAMA), shown
 
 
-def save_picture(target: Path, pixels: NDArray[np.uint8]) -> None:
+def save_picture(target: Path, pixels: ByteArray) -> None:
     """Write a picture (H, W, 3) BGR as JPEG, as a whole or not at all; its folder is created."""
     with replace_atomically(target) as path:
         path.write_bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())

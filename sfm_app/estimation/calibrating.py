@@ -108,10 +108,7 @@ def find_intrinsics(matches: MatchGraph, views: ViewGraph, run: RunContext) -> I
 
 
 def find_evidence(matches: MatchGraph, run: RunContext, known: Evidence) -> Evidence:
-    """Return the evidence of matches of which some are known: other pairs are fitted, and unknown cameras found.
-
-    Where pairs determine the cameras of half of the photos, more pairs change little.
-    """
+    """Return the evidence of matches of which some are known: other pairs are fitted, and unknown cameras found."""
     same = {pair for pair, rows in matches.matches.items() if known.matches.matches.get(pair) is rows}
     results = known.views.results
     views = find_views(matches, run, known.views.lenses, {pair: results[pair] for pair in same if pair in results})

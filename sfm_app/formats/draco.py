@@ -15,6 +15,7 @@ from sfm_app.formats.exporters import check_writable, pages_in_use, split_corner
 from sfm_app.formats.gltf import COMPONENTS, UNLIT, Glb, add_page_material, add_unlit_material, linear_colors, write_glb
 from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Model, Texture
+from sfm_app.types.arrays import FloatArray, IndexArray
 
 DRACO = "KHR_draco_mesh_compression"
 COLOR_ID = 7
@@ -73,7 +74,7 @@ def _colored_primitive(glb: Glb, model: Model) -> dict[str, Any]:
 
 
 def _compressed_primitive(
-    glb: Glb, vertices: NDArray[np.float64], faces: NDArray[np.int64], arrays: Mapping[str, Any]
+    glb: Glb, vertices: FloatArray, faces: IndexArray, arrays: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Add triangles as Draco's bytes, and return the primitive."""
     import DracoPy

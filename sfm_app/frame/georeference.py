@@ -10,7 +10,7 @@ from sfm_app.frame.coordinates import GPS_SYSTEM, LocalFrame, read_system
 from sfm_app.geometry.poses import Similarity, draw_pairs, perpendicular_basis, robust_similarity
 from sfm_app.numerical import FAILURES, MAD_TO_SIGMA
 from sfm_app.types import GpsPosition, Rejected
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray
 from sfm_app.types.photos import FILE
 
 MIN_POSITIONS = 3
@@ -174,7 +174,7 @@ def _fit_on_ground(
     return Georeference(fit, _median_position(given), used, len(places), rms, float(deviation))
 
 
-def _inlier_mask(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float) -> NDArray[np.bool_]:
+def _inlier_mask(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float) -> BoolArray:
     """Find the inliers of the best pair by truncated squared residuals, then refit until they no longer change."""
     best, least = np.ones(len(z), bool), np.inf
     for pair in draw_pairs(len(z), OPTIONS.max_pairs):

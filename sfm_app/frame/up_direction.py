@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.frame.up_cues import (
     Roll,
@@ -31,7 +30,7 @@ from sfm_app.geometry.poses import (
     perpendicular_component,
     smallest_eigenvector,
 )
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import ByteArray, FloatArray, IndexArray
 
 LINES, ROLL, GROUND, GPS = "vanishing lines", "camera roll", "ground plane", "GPS"
 WALL, CAMERAS = "wall", "cameras"
@@ -140,9 +139,9 @@ class Scenery:
     """(P, 3)"""
     brightness: FloatArray
     """(P,) 0 to 255."""
-    visible: tuple[NDArray[np.int64], ...]
+    visible: tuple[IndexArray, ...]
     """Per photo, the indices of its visible points."""
-    pictures: tuple[NDArray[np.uint8] | None, ...]
+    pictures: tuple[ByteArray | None, ...]
     """Per photo its small gray picture, or None."""
 
 

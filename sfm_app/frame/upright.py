@@ -8,7 +8,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import Reconstruction, translate_errors
 from sfm_app.colmap.model import (
@@ -30,7 +29,7 @@ from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import FAILURES, Json, error_reason
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import GpsPosition, MapPlace, MatchGraph, Rejected
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import ByteArray, FloatArray
 
 logger = logging.getLogger("sfm_app")
 
@@ -41,7 +40,7 @@ class PhotoCues:
 
     lines: FloatArray
     """(N, 4) line segments in pixels of the photo."""
-    picture: NDArray[np.uint8] | None
+    picture: ByteArray | None
     """The photo, gray and small; None if OpenCV cannot read it."""
 
 

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.fundamental.a_contrario import MOST_FALSE_ALARMS, accidental_share, false_alarms
 from sfm_app.fundamental.pretests import BailOut, PreTest
@@ -16,7 +15,7 @@ from sfm_app.fundamental.solvers import decompose_symmetric
 from sfm_app.jit import kernel
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, EpipolarGeometry, Rejected
-from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -421,7 +420,7 @@ def one_per_cell(points: FloatArray, size: tuple[int, int]) -> FloatArray:
     return points[np.unique(_cells(points, size), return_index=True)[1]]
 
 
-def _cells(points: FloatArray, size: tuple[int, int]) -> NDArray[np.int64]:
+def _cells(points: FloatArray, size: tuple[int, int]) -> IndexArray:
     cells = WATERMARK.cells
     columns, rows = (points / size * cells).astype(np.int64).clip(0, cells - 1).T
     return np.asarray(cells * rows + columns)

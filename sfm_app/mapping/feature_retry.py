@@ -22,7 +22,7 @@ from sfm_app.plugins import SIFT_DSP
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import SubWorkspace
 from sfm_app.types import Evidence, MatchGraph, PairId
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import FloatArray, IndexArray
 
 Rows = NDArray[np.uint32]
 
@@ -62,7 +62,7 @@ def add_matches(
     return replace(matches, keypoints=all_keypoints, matches=dict(sorted(rows.items()))), tuple(sorted(enriched))
 
 
-def _merge_keypoints(known: FloatArray, added: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+def _merge_keypoints(known: FloatArray, added: FloatArray) -> tuple[FloatArray, IndexArray]:
     """Return all keypoints of a photo, and the index of each added one among them."""
     from scipy.spatial import cKDTree
 

@@ -4,14 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.colmap.joined_model import PlacedPhotos
 from sfm_app.geometry.poses import Similarity, explained_mask, robust_similarity
 from sfm_app.numerical import FAILURES
 from sfm_app.posegraph.rotations import average_rotations, connected_groups, partners_of
 from sfm_app.types import MatchGraph, PairId, ViewGraph
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 # Joins. One photo in both models determines a similarity: rotation and position by its camera, scale by the distances
 # of its points. The similarity with which most shared photos agree is refined on their points.
@@ -155,7 +154,7 @@ class _SharedPhotos:
                 medians[number] = np.median(values[of_photo])
         return medians
 
-    def best_hypothesis(self) -> tuple[NDArray[np.bool_], Similarity]:
+    def best_hypothesis(self) -> tuple[BoolArray, Similarity]:
         """Return a mask of the agreeing photos for the best similarity of a single photo, and this similarity."""
         best, score = (np.zeros(len(self.ca), np.bool_), Similarity(1.0, np.eye(3), np.zeros(3))), (0, 0.0)
         for number in np.flatnonzero(np.isfinite(self.scale)):
@@ -167,7 +166,7 @@ class _SharedPhotos:
                 best, score = (agreeing, candidate), rank
         return best
 
-    def agreement(self, similarity: Similarity) -> tuple[NDArray[np.bool_], FloatArray]:
+    def agreement(self, similarity: Similarity) -> tuple[BoolArray, FloatArray]:
         """Return (n,) which photos agree, and their shifts by the distance of their points."""
         angles = _angles_deg(self.Ra, np.einsum("nij,kj->nik", self.Rb, similarity.R))
         shifts = np.linalg.norm(similarity(self.cb) - self.ca, axis=1) / self.distance
@@ -310,7 +309,7 @@ def _synchronize(joins: Sequence[Join], count: int) -> dict[int, Similarity]:
 
 
 def _robust_potentials(
-    count: int, edges: NDArray[np.int64], steps: FloatArray, strengths: FloatArray, sizes: FloatArray
+    count: int, edges: IndexArray, steps: FloatArray, strengths: FloatArray, sizes: FloatArray
 ) -> FloatArray:
     """Return (count, k) values with the least distances to steps (J, k), second less first, along edges (J, 2)."""
     groups = connected_groups(((a, b) for a, b in edges.tolist()), range(count))

@@ -333,10 +333,7 @@ def _affinity(overlap: ExpectedOverlap) -> float:
 def _assign_sides(
     non_overlapping: Mapping[PairId, ExpectedOverlap], overlaps: Mapping[PairId, ExpectedOverlap]
 ) -> dict[int, int]:
-    """Return the side, 1 or -1, of all photos with overlaps, the surest first.
-
-    Photos with the expected overlap pull a photo to their side, others push it to the opposite one.
-    """
+    """Return the side, 1 or -1, of all photos with overlaps, the surest first."""
     affinities: dict[int, dict[int, float]] = {photo: {} for photo in chain(*overlaps)}
     for (a, b), one in overlaps.items():
         affinities[a][b] = affinities[b][a] = _affinity(one)

@@ -28,6 +28,7 @@ from sfm_app.retrieval import (
 from sfm_app.runtime.context import Earlier, RunContext
 from sfm_app.settings import MatchSettings
 from sfm_app.types import MatchedImage, MatchGraph, PairId
+from sfm_app.types.arrays import ByteArray
 
 # The largest features of all photos become visual words. Photos with common words are compared in previews, and
 # matched where they seem to overlap, with neighbors in name, time and GPS. A second round follows the matches.
@@ -181,7 +182,7 @@ def match_probable_pairs(method: FeatureMethod, load: Callable[[], MatchGraph], 
     run.record(matched_pairs=len(first) + len(second), rounds=[len(first), len(second)])
 
 
-def _descriptors(method: FeatureMethod, image: MatchedImage, run: RunContext) -> NDArray[np.uint8]:
+def _descriptors(method: FeatureMethod, image: MatchedImage, run: RunContext) -> ByteArray:
     """Return descriptors of the largest features of a photo: its own where they are SIFT, else those of its picture."""
     if method.sift is None:
         return describe_picture(read_pixels(run.workspace.photos / image.name), OPTIONS.largest_features)

@@ -25,7 +25,7 @@ from PIL.TiffImagePlugin import COMPRESSION_INFO, IMAGELENGTH, IMAGEWIDTH, Image
 from sfm_app.operating_system import find_in_wheel
 from sfm_app.photos.files import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
 from sfm_app.types import CameraPrior, GpsPosition
-from sfm_app.types.arrays import BoolArray
+from sfm_app.types.arrays import BoolArray, ByteArray
 from sfm_app.types.photos import EXIF, SEA_LEVEL, TAKE_OFF
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "PSD", "SGI", "PCX", "QOI", "TGA")
@@ -317,10 +317,7 @@ def _parse_jpeg(data: bytes) -> _Jpeg:
 
 
 def is_whole_jpeg(data: bytes) -> bool:
-    """Return whether the data of each scan of a JPEG end with its last block.
-
-    Where markers divide the data into intervals, they must be complete.
-    """
+    """Return whether the data of each scan of a JPEG end with its last block."""
     jpeg = _parse_jpeg(data)
     if jpeg.coding not in (0xC0, 0xC1, 0xC2):
         return jpeg.coding in (0, 0xC3)  # nothing shows the damage of others
@@ -604,7 +601,7 @@ def opaque_pixels(image: Image.Image) -> BoolArray:
     return np.asarray(image.convert("RGBA").getchannel("A")) >= OPAQUE
 
 
-def fill_masked(pixels: NDArray[np.uint8], used: BoolArray) -> NDArray[np.uint8]:
+def fill_masked(pixels: ByteArray, used: BoolArray) -> ByteArray:
     """Return an RGB photo whose masked pixels have the color of the nearest usable one, for interpolation."""
     if used.all() or not used.any():
         return pixels
@@ -653,7 +650,7 @@ def _to_eight_bit(image: Image.Image) -> Image.Image:
     return image if image.mode in ("RGB", "L") else image.convert("RGB")
 
 
-def _to_gray_levels(deep: NDArray[Any]) -> NDArray[np.uint8]:
+def _to_gray_levels(deep: NDArray[Any]) -> ByteArray:
     """Map gray of 16 bits or any other range to 256 levels."""
     values = np.nan_to_num(deep.astype(np.float64))
     low, high = values.min(), values.max()

@@ -31,6 +31,7 @@ from sfm_app.photos.panoramas import is_panorama
 from sfm_app.photos.selection import PhotoStats, measure_photo
 from sfm_app.settings import PhotoSettings
 from sfm_app.types import Frame, GivenCameras, Photo, UnusablePhoto
+from sfm_app.types.arrays import ByteArray, FloatArray, IndexArray
 from sfm_app.types.camera import EQUIRECTANGULAR, PERSPECTIVE
 from sfm_app.types.photos import FILE, SEA_LEVEL, TAKE_OFF
 
@@ -120,19 +121,19 @@ def _cluster_frames(photos: Sequence[Photo]) -> tuple[list[list[Frame]], list[in
     return clusters, numbers
 
 
-def _frame_within(photo: Photo, edges: NDArray[np.float64]) -> Frame | None:
+def _frame_within(photo: Photo, edges: FloatArray) -> Frame | None:
     """Return the frame with these edges; None if it is the whole photo."""
     left, top, right, bottom = (round(float(value)) for value in edges)
     whole = (left, top, right, bottom) == (0, 0, photo.width, photo.height)
     return None if whole else (left, top, right - left, bottom - top)
 
 
-def _edges(frame: Frame) -> NDArray[np.int64]:
+def _edges(frame: Frame) -> IndexArray:
     left, top, width, height = frame
     return np.array([left, top, left + width, top + height])
 
 
-def _bar_thickness(lines: NDArray[np.uint8]) -> int:
+def _bar_thickness(lines: ByteArray) -> int:
     """Return how many of the first lines of (N, M, 3) form a bar."""
     color = np.median(lines[0], axis=0).astype(np.int16)
     most = int(BARS.max_share * len(lines))
@@ -148,7 +149,7 @@ def _bar_thickness(lines: NDArray[np.uint8]) -> int:
     return first if 0 < edge <= first + BARS.blur_px else edge
 
 
-def _differing_share(line: NDArray[np.uint8], color: NDArray[np.int16], levels: int) -> float:
+def _differing_share(line: ByteArray, color: NDArray[np.int16], levels: int) -> float:
     """Return the share of a line (M, 3) that differs from a color by more than `levels`."""
     return float(np.mean(np.max(np.abs(line.astype(np.int16) - color), axis=1) > levels))
 

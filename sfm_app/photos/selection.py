@@ -10,12 +10,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.files import fingerprint, load_arrays, replace_atomically
 from sfm_app.settings import PhotoSettings
 from sfm_app.types import Photo, UnusablePhoto
+from sfm_app.types.arrays import Float32Array
 
 logger = logging.getLogger("sfm_app")
 
@@ -66,7 +66,7 @@ class PhotoStats:
     """A usable photo and its image statistics."""
 
     photo: Photo
-    thumbnail: NDArray[np.float32]
+    thumbnail: Float32Array
     """(SIDE_PX, SIDE_PX) upright and gray."""
     blur: float = 0.0
     """Share of their slope that edges keep after one more blur; near 1 if the photo is blurred."""
@@ -106,7 +106,7 @@ def flat_share(picture: Image.Image) -> float:
     return float(np.mean(low.min(axis=2) == high.max(axis=2)))
 
 
-def _edge_slope(image: NDArray[np.float32], axis: int) -> float:
+def _edge_slope(image: Float32Array, axis: int) -> float:
     return float(np.percentile(np.abs(np.diff(image, axis=axis)), OPTIONS.edge_percentile))
 
 

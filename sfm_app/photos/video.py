@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sfm_app.photos.decode import UnreadableError
 from sfm_app.photos.files import container, read_head
-from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.types.arrays import BoolArray, Float32Array, FloatArray, IndexArray
 
 if TYPE_CHECKING:  # PyAV takes a tenth of a second to load
     from av import VideoFrame, VideoStream
@@ -23,7 +23,6 @@ if TYPE_CHECKING:  # PyAV takes a tenth of a second to load
     from av.filter import Graph
 
 Picture = NDArray[np.uint8]
-Float32Array = NDArray[np.float32]
 
 BLURRED = 0.5
 """A frame with less than this share of its neighbors' sharpness is blurred."""
@@ -425,11 +424,11 @@ def sharpest_frames(path: FloatArray, sharpness: FloatArray, spacing: float) -> 
     return chosen, candidates
 
 
-def _sharpest_frame(sharpness: FloatArray, frames: NDArray[np.int64]) -> int:
+def _sharpest_frame(sharpness: FloatArray, frames: IndexArray) -> int:
     return int(frames[np.argmax(sharpness[frames])])
 
 
-def _nearby_frames(path: FloatArray, moment: int, target: float, reach: float, first: int) -> NDArray[np.int64]:
+def _nearby_frames(path: FloatArray, moment: int, target: float, reach: float, first: int) -> IndexArray:
     """Return the consecutive frames around a moment whose motion is within `reach` steps of the target."""
     outside = np.abs(path - target) > reach
     outside[:first] = True

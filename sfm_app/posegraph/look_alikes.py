@@ -11,13 +11,12 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.bearings import bearings, depths_along, project
 from sfm_app.geometry.epipolar import FIRST, SECOND, depths
 from sfm_app.posegraph.rotations import DisjointGroups, average_rotations, partners_of
 from sfm_app.types import Calibration, LookAlikes, MatchGraph, PairId, RelativePose
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 # Coverage and backbone. Neighbors on a walk share most of the content that the set knows of either. Photos of equal
 # things in different places share only the things, however many matches these give, and nothing around them.
@@ -97,7 +96,7 @@ def compute_visibility(matches: MatchGraph, poses: Mapping[PairId, RelativePose]
     return Visibility(rows, partners, cells)
 
 
-def cell_numbers(x: NDArray[np.float64], width: int, height: int) -> IndexArray:
+def cell_numbers(x: FloatArray, width: int, height: int) -> IndexArray:
     """Return the numbers (N,) of the cells of pixels (N, 2) inside a photo, less than (`cells` + 1) squared."""
     columns, lines = (x // (max(width, height) / OPTIONS.cells)).astype(np.int64).T
     return np.asarray(lines * (OPTIONS.cells + 1) + columns, np.int64)
@@ -238,13 +237,13 @@ class Depths:
         return np.asarray(points[expected], np.int64)
 
 
-def is_well_inside(x: FloatArray, width: int, height: int) -> NDArray[np.bool_]:
+def is_well_inside(x: FloatArray, width: int, height: int) -> BoolArray:
     """Return a mask (N,) of the pixels (N, 2) inside a photo and off its border; NaN is outside."""
     size = np.array([width, height], np.float64)
     return np.asarray(((x > OPTIONS.border * size) & (x < (1.0 - OPTIONS.border) * size)).all(axis=1))
 
 
-def is_matched_again(size_ratios: FloatArray, cosines: FloatArray) -> NDArray[np.bool_]:
+def is_matched_again(size_ratios: FloatArray, cosines: FloatArray) -> BoolArray:
     """Return a mask (N,) of the points that look alike in two photos, by ratios of sizes and cosines of rays."""
     alike = (
         (size_ratios < OPTIONS.max_scale)

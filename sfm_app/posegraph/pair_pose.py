@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.bearings import bearings
 from sfm_app.fundamental.degeneracy import DEGENERACY, dominant_homography, transfer_distance
@@ -35,7 +34,7 @@ from sfm_app.geometry.poses import (
 )
 from sfm_app.jit import kernel
 from sfm_app.types import Calibration, EpipolarFit, EpipolarGeometry, RelativePose
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray
 from sfm_app.types.camera import PERSPECTIVE
 
 # Initial poses. With a long lens, matches determine the directions of epipolar lines, but hardly where they meet: the
@@ -220,7 +219,7 @@ class Pair:
             return eight_point(inliers[:, :2], inliers[:, 9:11])
         return second.K.T @ fit.F @ first.K
 
-    def pose(self, R: FloatArray, t: FloatArray, inliers: NDArray[np.bool_], *, guided: bool = False) -> RelativePose:
+    def pose(self, R: FloatArray, t: FloatArray, inliers: BoolArray, *, guided: bool = False) -> RelativePose:
         """Return a pose with the statistics of its inliers, a mask (M,)."""
         used = self.lines[inliers]
         front = is_in_front(used, R, t)
@@ -233,7 +232,7 @@ class Pair:
             guided=guided,
         )  # fmt: skip
 
-    def inliers(self, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
+    def inliers(self, R: FloatArray, t: FloatArray) -> BoolArray:
         """Return a mask (M,) of the matches within the threshold of a pose with |t| = 1."""
         return pose_distances(self.lines, R, t) <= self.max_error_px
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.types import PairId
@@ -258,7 +257,7 @@ def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) ->
     return np.asarray((sums[0] + least) / (sums[1] + least), np.float64)
 
 
-def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArray[np.bool_]]:
+def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, BoolArray]:
     """Return (L, 3) edges of every loop of three photos, and whether it agrees; edges have the smaller photo first."""
     from scipy.spatial.transform import Rotation
 

@@ -167,10 +167,7 @@ def plain_text(line: str) -> str:
 
 
 def unknown_cameras(contents: RunContents) -> list[str]:
-    """Return reason, used value and remedy for each undetermined camera.
-
-    A camera without placed photos does not affect the model, and is omitted.
-    """
+    """Return reason, used value and remedy for each undetermined camera."""
     cameras = contents.intrinsics.cameras if contents.intrinsics is not None else {}
     after = contents.scene.cameras if contents.scene is not None else {}
     return [

@@ -114,10 +114,7 @@ def _choose(
 
 
 def log_probability(labels: IndexArray) -> float:
-    """Return the log-probability of cameras of photos (N,) before any pair (Ewens 1972, with the parameter 1).
-
-    All numbers of photos of the first photo's camera are equally likely.
-    """
+    """Return the log-probability of cameras of photos (N,) before any pair (Ewens 1972, with the parameter 1)."""
     counts = np.bincount(labels)
     return sum(map(lgamma, counts[counts > 0].tolist())) - lgamma(len(labels) + 1)
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.models import ASPECT, CENTER, FOCAL, FREE_SHARE, LENS, NARROW, WIDE
 from sfm_app.geometry.least_squares import (
@@ -26,7 +25,7 @@ from sfm_app.geometry.least_squares import (
 from sfm_app.selfcal.adjustment import CAMERA, Prior
 from sfm_app.selfcal.pairs import CENTER_U, KAPPA, LOG_ASPECT, LOG_FOCAL
 from sfm_app.types import CameraPrior
-from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 NAMES = ("center", "aspect", "k1", "focal")
 """Names of the parts in `Calibration.held`."""
@@ -221,7 +220,7 @@ def redundancy(free: BoolArray, pairs: float) -> float:
 class TiedPriors(CameraPriors):
     """Hierarchical priors: the focals of a family scatter about their own mean, which is set to its optimum."""
 
-    families: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    families: IndexArray = field(default_factory=lambda: np.empty(0, np.int64))
     """(C,) number of each camera's family; -1 for none."""
 
     def prior(self, free: BoolArray, thetas: FloatArray, held: BoolArray | None = None) -> Prior:

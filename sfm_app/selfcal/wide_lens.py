@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera import rows as families
 from sfm_app.camera.projection import RAY, Fisheye, image_rays
@@ -392,7 +391,7 @@ class _SampledPairs:
     """Matches (N, 4) of some pairs in longer sides from the middle, and samples (S, 8) of each."""
 
     matches: tuple[FloatArray, ...]
-    samples: tuple[NDArray[np.int64], ...]
+    samples: tuple[IndexArray, ...]
     threshold: float
 
     def search(self, lens: Lens | Equirectangular) -> list[tuple[float, FloatArray]]:

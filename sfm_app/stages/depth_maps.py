@@ -8,7 +8,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.colmap.dense import (
     DenseStore,
@@ -34,7 +33,7 @@ from sfm_app.stereo import DepthTask, View, rank_neighbors
 from sfm_app.stereo.sky import PhotoAreas, blank_areas, count_votes, find_skies, sky_pixels
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Rejected, Scene
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
 
@@ -115,7 +114,7 @@ def _count_votes(photos: Shared[tuple[Sequence[PhotoAreas], Sequence[View]]], in
     return count_votes(*photos.value, index)
 
 
-def _drop_sky(dense_dir: Path, skies: Shared[Mapping[str, NDArray[np.bool_]]], photo: tuple[int, View]) -> float:
+def _drop_sky(dense_dir: Path, skies: Shared[Mapping[str, BoolArray]], photo: tuple[int, View]) -> float:
     """Remove the depths of the sky of one photo, and return its share of the photo."""
     number, view = photo
     sky = sky_pixels(read_gray(dense_dir, view), skies.value[str(number)])

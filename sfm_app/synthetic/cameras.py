@@ -131,10 +131,7 @@ class Views:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArcOptions:
-    """A hand-held walk around the front of a scene: distance, height, aim and roll vary from photo to photo.
-
-    They vary because a circle around a point that all photos look at (an orbit) leaves the focal length undetermined.
-    """
+    """A hand-held walk around the front of a scene: distance, height, aim and roll vary from photo to photo."""
 
     photos: int = 12
     """>= 2."""

@@ -33,10 +33,7 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 def algorithm_3(
     pairs: Pairs, tall: float, evidence: dict[str, float], equations: Equations = DEFAULT
 ) -> CameraParameters:
-    """Estimate the camera from K_init by Algorithm 3 as the thesis writes it, in image widths.
-
-    Adds the number of iterations and the effective number of pairs to the evidence.
-    """
+    """Estimate the camera from K_init by Algorithm 3 as the thesis writes it, in image widths."""
     camera, weights = CameraParameters.initial(tall), np.ones(len(pairs))
     for iteration in range(1, MOST_ITERATIONS + 1):
         before, camera = camera, fit_camera(pairs, camera, weights, equations)
