@@ -170,9 +170,7 @@ def _distortion(values: Mapping[str, Any]) -> list[float]:
         return [float(plain.get(name) or 0.0) for name in TERMS]
     unknown = [name for name in plain.keys() - {*MATRIX, *SIZE, *OTHER_KEYS} if _length(plain[name]) in COUNTS]
     if unknown:
-        raise ValueError(
-            f"'{min(unknown)}' beside the camera matrix may be its distortion: call it dist_coeffs, or remove it"
-        )
+        raise ValueError(f"'{min(unknown)}' may be the distortion: call it dist_coeffs, or remove it")
     return []
 
 

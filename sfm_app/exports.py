@@ -314,9 +314,7 @@ def check_parts(main: Path, parts: Sequence[str]) -> None:
     named = b"".join(_beginning(path) for path in (main, *present) if path.is_file())
     foreign = [path.name for path in present if path.name.encode() not in named]
     if foreign:
-        raise InputError(
-            f"{foreign[0]} beside {main} is no part of an earlier export, and would be lost", hint=ELSEWHERE
-        )
+        raise InputError(f"{foreign[0]} beside {main} is no part of an earlier export", hint=ELSEWHERE)
 
 
 def _beginning(path: Path) -> bytes:

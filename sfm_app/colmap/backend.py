@@ -38,19 +38,19 @@ LEVELS = tuple(level.value for level in (_Level.FATAL, _Level.WARNING, _Level.IN
 # The stubs of pycolmap 4.2 do not type the elements of COLMAP's maps.
 
 
-def all_cameras(model: pycolmap.Reconstruction) -> Iterable[pycolmap.Camera]:
+def all_cameras(model: Reconstruction) -> Iterable[pycolmap.Camera]:
     """Return all cameras of a model."""
     cameras: Iterable[pycolmap.Camera] = model.cameras.values()
     return cameras
 
 
-def all_points(model: pycolmap.Reconstruction) -> Iterable[tuple[int, pycolmap.Point3D]]:
+def all_points(model: Reconstruction) -> Iterable[tuple[int, pycolmap.Point3D]]:
     """Return all points of a model with their ids."""
     points: Iterable[tuple[int, pycolmap.Point3D]] = model.points3D.items()
     return points
 
 
-def largest_model(models: Mapping[int, pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
+def largest_model(models: Mapping[int, Reconstruction]) -> Reconstruction | None:
     """Return the model with most photos; None if there is no model."""
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
@@ -139,11 +139,9 @@ def has_running_call() -> bool:
     return any(thread.name == THREAD_NAME for thread in threading.enumerate())
 
 
-def run_interruptible(
-    call: Callable[[pycolmap.CancellationToken], Result], poll: Callable[[], None] = lambda: None
-) -> Result:
+def run_interruptible(call: Callable[[CancellationToken], Result], poll: Callable[[], None] = lambda: None) -> Result:
     """Run a long COLMAP call in a thread, so that Ctrl-C cancels its token; `poll` is called twice a second."""
-    token = pycolmap.CancellationToken()
+    token = CancellationToken()
     with ThreadPoolExecutor(1, thread_name_prefix="colmap") as thread:
         future = thread.submit(call, token)
         try:
@@ -156,11 +154,7 @@ def run_interruptible(
 
 
 def run_with_progress(
-    call: Callable[[pycolmap.CancellationToken], None],
-    done: Callable[[], int],
-    label: str,
-    total: int,
-    progress: Progress,
+    call: Callable[[CancellationToken], None], done: Callable[[], int], label: str, total: int, progress: Progress
 ) -> None:
     """Run a long COLMAP call as `run_interruptible` does, with a progress bar; `done` counts the finished steps."""
     steps = 0

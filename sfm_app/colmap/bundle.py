@@ -33,7 +33,15 @@ from sfm_app.bundle.lens_parts import (
 from sfm_app.bundle.normal_equations import Bundle, best_step, bundle_scale, cost, elimination_width, reduce
 from sfm_app.camera.models import FILE_MODELS, INDEX, PARAMETERS, file_model, params_of_row, row_of_calibration
 from sfm_app.camera.rows import CX, CY, FISHEYE, FX, FY, PANORAMA, PERSPECTIVE
-from sfm_app.colmap.backend import all_cameras, all_points, pycolmap, run_in_daemon_thread, translate_errors
+from sfm_app.colmap.backend import (
+    Camera,
+    Reconstruction,
+    all_cameras,
+    all_points,
+    pycolmap,
+    run_in_daemon_thread,
+    translate_errors,
+)
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import RefinedCamera, camera_family, finite_mask, posed_images, read_camera, submodel
 from sfm_app.errors import NumericalError
@@ -49,7 +57,7 @@ Rules = Mapping[int, CameraRule]
 NO_RULES: Rules = MappingProxyType({})
 
 
-def write_camera(camera: pycolmap.Camera, params: FloatArray, family: int) -> None:
+def write_camera(camera: Camera, params: FloatArray, family: int) -> None:
     """Change a camera in place to the smallest of FILE_MODELS with these parameters (12,), unless it is a panorama."""
     if family == PANORAMA:
         return
@@ -58,7 +66,7 @@ def write_camera(camera: pycolmap.Camera, params: FloatArray, family: int) -> No
     camera.params = params_of_row(params, name)
 
 
-def read_bundle(model: pycolmap.Reconstruction, rules: Rules = NO_RULES) -> tuple[list[int], Bundle]:
+def read_bundle(model: Reconstruction, rules: Rules = NO_RULES) -> tuple[list[int], Bundle]:
     """Return the ids of the cameras in use, and the model as arrays; cameras that rules keep are fixed."""
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
     ids, points = sorted(photos_per_camera(model)), sorted(model.points3D)
@@ -94,7 +102,7 @@ def _read_observations(
     )
 
 
-def write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle) -> None:
+def write_bundle(model: Reconstruction, ids: list[int], bundle: Bundle) -> None:
     """Write cameras, poses and points, in the order of `read_bundle`, into a model in place."""
     for camera_id, params, family in zip(ids, bundle.params, bundle.family, strict=True):
         write_camera(model.cameras[camera_id], params, int(family))
@@ -105,7 +113,7 @@ def write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle)
         model.points3D[point].xyz = xyz
 
 
-def photos_per_camera(model: pycolmap.Reconstruction) -> Counter[int]:
+def photos_per_camera(model: Reconstruction) -> Counter[int]:
     """Return the number of posed photos of each camera, by its id."""
     return Counter(model.images[image_id].camera_id for image_id in sorted(model.reg_image_ids()))
 
@@ -167,7 +175,7 @@ class Rounds:
 
 
 def adjust_in_rounds(
-    model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph | None, rules: Rules = NO_RULES
+    model: Reconstruction, graph: pycolmap.CorrespondenceGraph | None, rules: Rules = NO_RULES
 ) -> Rounds:
     """Refine cameras, poses, points and tracks of a model in place, until they no longer change.
 
@@ -195,7 +203,7 @@ def adjust_in_rounds(
     return Rounds(ids, bundle, lenses, reduced.noise_px, open_points[0])
 
 
-def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None:
+def solve(model: Reconstruction, refined: Collection[int] = ()) -> None:
     """Adjust poses, points and the focals of `refined` cameras in place, on one thread: sums over several vary."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
@@ -215,7 +223,7 @@ def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None
     run_in_daemon_thread(pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve)
 
 
-def _choose_most_factored(model: pycolmap.Reconstruction) -> int:
+def _choose_most_factored(model: Reconstruction) -> int:
     """Return the number of photos up to which COLMAP's solver factors the normal equations: all, or `most_tied`."""
     photos = sorted(model.reg_image_ids())
     if len(photos) <= OPTIONS.most_tied:
@@ -228,7 +236,7 @@ def _choose_most_factored(model: pycolmap.Reconstruction) -> int:
     return len(photos) if elimination_width(photo, point) <= OPTIONS.most_tied else OPTIONS.most_tied
 
 
-def improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph) -> int:
+def improve_tracks(model: Reconstruction, graph: pycolmap.CorrespondenceGraph) -> int:
     """Continue, merge, triangulate and filter tracks in place; return by how many observations their number changed.
 
     Observations that are added and filtered again do not count: near the limits they come and go forever.
@@ -244,7 +252,7 @@ def improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.Correspondenc
     return abs(int(model.compute_num_observations() - before))
 
 
-def lens_priors(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle, rules: Rules = NO_RULES) -> LensPriors:
+def lens_priors(model: Reconstruction, ids: list[int], bundle: Bundle, rules: Rules = NO_RULES) -> LensPriors:
     """Return the priors of the cameras, before any evidence from the bundle."""
     used = photos_per_camera(model)
     sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
@@ -284,13 +292,13 @@ class LensRecord:
 class Families:
     """A model with cameras of the most probable families."""
 
-    model: pycolmap.Reconstruction
+    model: Reconstruction
     """The given model where no camera changes its family; else another, to be adjusted again."""
     rivals: Mapping[int, LensChoice] = field(default_factory=dict)
     """By camera id, the best model of the rejected family; its evidence is what it loses."""
 
 
-def best_families(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules = NO_RULES) -> Families:
+def best_families(model: Reconstruction, rounds: Rounds, rules: Rules = NO_RULES) -> Families:
     """Choose the family of every camera that suggests the other one, by the evidence of its observations.
 
     Both families are adjusted to the same tracks; `model` stays. Rules may require a camera's family.
@@ -307,7 +315,7 @@ def best_families(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules =
             continue
         photos = _spread_photos(model, camera_id)
         part = model if photos is None else submodel(model, photos)
-        trial, same = pycolmap.Reconstruction(part), pycolmap.Reconstruction(part)
+        trial, same = Reconstruction(part), Reconstruction(part)
         write_camera(trial.cameras[camera_id], other, FISHEYE if family == PERSPECTIVE else PERSPECTIVE)
         try:
             adjust_in_rounds(same, None, rules)
@@ -323,7 +331,7 @@ def best_families(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules =
     return Families(model, rivals)
 
 
-def _spread_photos(model: pycolmap.Reconstruction, camera_id: int) -> list[int] | None:
+def _spread_photos(model: Reconstruction, camera_id: int) -> list[int] | None:
     """Return photos of a camera at even steps among all of them; None if the model has few photos."""
     if model.num_reg_images() <= OPTIONS.most_compared:
         return None
@@ -331,15 +339,15 @@ def _spread_photos(model: pycolmap.Reconstruction, camera_id: int) -> list[int] 
     return own[:: -(-len(own) // OPTIONS.most_compared)]
 
 
-def _with_camera(model: pycolmap.Reconstruction, camera: pycolmap.Camera) -> pycolmap.Reconstruction:
-    copy = pycolmap.Reconstruction(model)
+def _with_camera(model: Reconstruction, camera: Camera) -> Reconstruction:
+    copy = Reconstruction(model)
     own = copy.cameras[camera.camera_id]
     own.model, own.params = camera.model, camera.params.tolist()
     return copy
 
 
 def _compare(
-    first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, camera_id: int, rules: Rules
+    first: Reconstruction, second: Reconstruction, camera_id: int, rules: Rules
 ) -> tuple[tuple[float, LensChoice], ...]:
     """Return the evidence and the best model of a camera in two models with the same tracks."""
     read = [(model, *read_bundle(model, rules)) for model in (first, second)]
@@ -355,9 +363,7 @@ def _compare(
     return tuple(compared)
 
 
-def record_lenses(
-    model: pycolmap.Reconstruction, rounds: Rounds, others: Mapping[int, LensChoice]
-) -> dict[int, LensRecord]:
+def record_lenses(model: Reconstruction, rounds: Rounds, others: Mapping[int, LensChoice]) -> dict[int, LensRecord]:
     """Return the chosen model of each camera and its rivals, by camera id; `others` are rivals of the other family."""
     records = {}
     for row, camera_id in enumerate(rounds.ids):
@@ -382,7 +388,7 @@ def _observed_reach(bundle: Bundle, row: int) -> float:
 class Adjustment:
     """The refined model, and the uncertainty of its cameras."""
 
-    model: pycolmap.Reconstruction
+    model: Reconstruction
     refined: dict[int, RefinedCamera]
     """By camera id."""
     failure: str = ""
@@ -398,7 +404,7 @@ class Adjustment:
 
 
 def adjust(
-    model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES, *, families_known: bool = False
+    model: Reconstruction, database: Path, rules: Rules = NO_RULES, *, families_known: bool = False
 ) -> Adjustment:
     """Refine cameras, poses, points and tracks in turn; only camera parameters that the photos determine are freed.
 
@@ -407,7 +413,7 @@ def adjust(
     them. Then tracks are completed and filtered. The given model is not changed; with `families_known`, an earlier
     adjustment has chosen between fisheye and perspective lenses. NumericalError if it diverges.
     """
-    model = pycolmap.Reconstruction(model)
+    model = Reconstruction(model)
     for camera in all_cameras(model):
         write_camera(camera, read_camera(camera), camera_family(camera))
     if rules:
@@ -430,7 +436,7 @@ def adjust(
 
 
 def adjust_or_keep(
-    model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES, *, families_known: bool = False
+    model: Reconstruction, database: Path, rules: Rules = NO_RULES, *, families_known: bool = False
 ) -> Adjustment:
     """Adjust a model; where that fails numerically, return the given model with the reason."""
     try:
@@ -442,13 +448,13 @@ def adjust_or_keep(
         return Adjustment(model, dict.fromkeys(photos_per_camera(model), unknown), failure=error_reason(err))
 
 
-def drop_infinite_points(model: pycolmap.Reconstruction) -> None:
+def drop_infinite_points(model: Reconstruction) -> None:
     """Remove points at infinity, in place."""
     for point_id in [key for key, point in all_points(model) if not finite_mask(point.xyz)]:
         model.delete_point3D(point_id)
 
 
-def find_correspondences(model: pycolmap.Reconstruction, database: Path) -> pycolmap.CorrespondenceGraph:
+def find_correspondences(model: Reconstruction, database: Path) -> pycolmap.CorrespondenceGraph:
     """Return the graph of all matches between the photos of a model."""
     options = pycolmap.DatabaseCacheOptions()
     options.load_all_images = True  # else photos that no pair in the database connects would be missing
@@ -481,7 +487,7 @@ def _adjusted_names(rounds: Rounds, row: int) -> tuple[str, ...]:
     return PARAMETERS[file_model(rounds.lenses.params[row], family)]
 
 
-def apply_rules(model: pycolmap.Reconstruction, rules: Rules) -> None:
+def apply_rules(model: Reconstruction, rules: Rules) -> None:
     """Give cameras the user's values or model, in place, and adjust poses and points to them."""
     changed = False
     for camera_id, rule in rules.items():
@@ -505,7 +511,7 @@ def apply_rules(model: pycolmap.Reconstruction, rules: Rules) -> None:
         solve(model)
 
 
-def given_estimates(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules) -> dict[int, Calibration]:
+def given_estimates(model: Reconstruction, rounds: Rounds, rules: Rules) -> dict[int, Calibration]:
     """Return estimates of the user's cameras by id, if the photos determine them.
 
     If one is kept, everything is adjusted once more with free cameras, to the same tracks.
@@ -514,7 +520,7 @@ def given_estimates(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules
         return {}
     if any(rule.is_kept for rule in rules.values()):
         try:
-            rounds = adjust_in_rounds(pycolmap.Reconstruction(model), None)
+            rounds = adjust_in_rounds(Reconstruction(model), None)
         except FAILURES as err:
             logger.info("the user's cameras could not be checked", exc_info=err)
             return {}

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from sfm_app.colmap import tasks
-from sfm_app.colmap.backend import check_written, pycolmap, translate_errors
+from sfm_app.colmap.backend import Camera, Reconstruction, check_written, pycolmap, translate_errors
 from sfm_app.colmap.model import all_images
 from sfm_app.colmap.worker_process import run_worker
 from sfm_app.files import digest_files, is_below
@@ -31,14 +31,14 @@ MAPS = ("sparse", "images", f"stereo/{DEPTHS}", f"stereo/{NORMALS}")
 """Folders from which a finished workspace is read."""
 
 
-def cameras_of_photos(model_dir: Path) -> dict[str, pycolmap.Camera]:
+def cameras_of_photos(model_dir: Path) -> dict[str, Camera]:
     """Return the camera of each photo of a model, by name."""
     with translate_errors("reading the model"):
-        model = pycolmap.Reconstruction(model_dir)
+        model = Reconstruction(model_dir)
         return {image.name: model.cameras[image.camera_id] for image in all_images(model)}
 
 
-def undistort_mask(cameras: Shared[Mapping[str, pycolmap.Camera]], mask_dir: Path, dense_dir: Path, view: View) -> None:
+def undistort_mask(cameras: Shared[Mapping[str, Camera]], mask_dir: Path, dense_dir: Path, view: View) -> None:
     """Write the mask of an undistorted photo: a pixel is used if all original pixels under it are."""
     used, camera = read_mask(mask_dir, view.name), cameras.value[view.name]
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
@@ -86,14 +86,14 @@ def undistort(
 def read_views(dense_dir: Path) -> list[View]:
     """Return the undistorted views with the sparse points that they observe, by name."""
     with translate_errors("reading the undistorted model"):
-        model = pycolmap.Reconstruction(dense_dir / "sparse")
+        model = Reconstruction(dense_dir / "sparse")
         images = sorted(all_images(model), key=lambda image: image.name)
         if not all(is_below(image.name) for image in images):
             raise ValueError(f"the model in {dense_dir} names photos outside of it")
         return [_view(model, image) for image in images if image.has_pose]
 
 
-def _view(model: pycolmap.Reconstruction, image: pycolmap.Image) -> View:
+def _view(model: Reconstruction, image: pycolmap.Image) -> View:
     camera = model.cameras[image.camera_id]
     ids = sorted({point.point3D_id for point in image.points2D if point.has_point3D()})
     return View(

@@ -10,7 +10,14 @@ from functools import partial
 from pathlib import Path
 
 from sfm_app.colmap import tasks
-from sfm_app.colmap.backend import CancellationToken, all_cameras, check_written, largest_model, pycolmap
+from sfm_app.colmap.backend import (
+    CancellationToken,
+    Reconstruction,
+    all_cameras,
+    check_written,
+    largest_model,
+    pycolmap,
+)
 from sfm_app.colmap.database import SQUARE_PIXELS
 from sfm_app.colmap.worker_process import start_worker
 
@@ -18,12 +25,12 @@ from sfm_app.colmap.worker_process import start_worker
 def map_incrementally(
     database: Path,
     photo_dir: Path,
-    start: pycolmap.Reconstruction,
+    start: Reconstruction,
     scratch: Path,
     options: pycolmap.IncrementalPipelineOptions,
     tick: Callable[[], None],
-    token: pycolmap.CancellationToken,
-) -> pycolmap.Reconstruction | None:
+    token: CancellationToken,
+) -> Reconstruction | None:
     """Register photo by photo, beginning with two or more in `start`; return None when COLMAP gives no model.
 
     The scratch folder is emptied first and removed afterwards; `tick` is called before every further photo.
@@ -55,7 +62,7 @@ def copy_database(database: Path, scratch: Path) -> None:
 
 def map_globally(
     photo_dir: Path, names: Sequence[str], scratch: Path, seed: int, token: CancellationToken
-) -> pycolmap.Reconstruction | None:
+) -> Reconstruction | None:
     """Find the poses of all these photos at once (GLOMAP: rotations, positions, adjustment); None if it gave no model.
 
     COLMAP has no way to stop this, so it runs in a separate process. The folder, from `copy_database`, is removed.
@@ -66,15 +73,15 @@ def map_globally(
 
 def map_with_colmap_defaults(
     photo_dir: Path, scratch: Path, seed: int, token: CancellationToken
-) -> pycolmap.Reconstruction | None:
-    """Verify the raw matches and map the photos by COLMAP's defaults, with the cameras of the database as first guess."""
+) -> Reconstruction | None:
+    """Verify the raw matches and map the photos by COLMAP's defaults, with the database's cameras as first guess."""
     call = partial(tasks.map_with_defaults, scratch, photo_dir, seed)
     return _map_in_process(call, scratch, "mapping photos by its defaults", token)
 
 
 def _map_in_process(
     call: Callable[[], None], scratch: Path, doing: str, token: CancellationToken
-) -> pycolmap.Reconstruction | None:
+) -> Reconstruction | None:
     try:
         with start_worker(call) as process:
             while not process.has_ended(0.1):
@@ -82,7 +89,7 @@ def _map_in_process(
                     return None
             process.check(doing)
         model_dir = scratch / "model"
-        return pycolmap.Reconstruction(model_dir) if model_dir.exists() else None
+        return Reconstruction(model_dir) if model_dir.exists() else None
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 

@@ -13,7 +13,7 @@ import numpy as np
 from sfm_app.camera.perspective_views import PerspectiveView, center_view
 from sfm_app.camera.rows import FX
 from sfm_app.colmap import tasks
-from sfm_app.colmap.backend import check_written, pycolmap, translate_errors
+from sfm_app.colmap.backend import Reconstruction, check_written, pycolmap, translate_errors
 from sfm_app.colmap.model import finite_points, point_arrays, posed_images
 from sfm_app.colmap.wide_views import (
     ViewNames,
@@ -32,7 +32,7 @@ from sfm_app.types.arrays import Float32Array, FloatArray
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
 
 
-def full_size_lenses(model: pycolmap.Reconstruction, *, centered: bool) -> dict[int, WideLens]:
+def full_size_lenses(model: Reconstruction, *, centered: bool) -> dict[int, WideLens]:
     """Return the views of every camera at full size, by id; `centered` ones have square pixels and a central axis."""
     with translate_errors("undistorting the cameras"):
         lenses = perspective_lenses(model, 65_000)  # pixels: what JPEG can hold, rounded down
@@ -44,7 +44,7 @@ def full_size_lenses(model: pycolmap.Reconstruction, *, centered: bool) -> dict[
 class PixelMaps:
     """Pixels of a photo that its views show, by camera; those of the last camera are kept for its other photos."""
 
-    def __init__(self, model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens]) -> None:
+    def __init__(self, model: Reconstruction, lenses: Mapping[int, WideLens]) -> None:
         self._model, self._lenses, self._lock = model, lenses, threading.Lock()
         self._known: tuple[int, list[Float32Array]] = (-1, [])
 
@@ -66,7 +66,7 @@ class PixelMaps:
 
 
 def perspective_photos(
-    model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames
+    model: Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames
 ) -> tuple[PerspectivePhoto, ...]:
     """Return the views of all posed photos, by name of the photo."""
     return tuple(
@@ -77,7 +77,7 @@ def perspective_photos(
 
 
 def write_view_model(
-    model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames, folder: Path, *,
+    model: Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames, folder: Path, *,
     text: bool = False,
 ) -> None:  # fmt: skip
     """Write COLMAP's model of the views into a new or existing folder, as text or binary."""
@@ -93,7 +93,7 @@ def write_view_model(
     check_written(*folder.iterdir())
 
 
-def all_points(model: pycolmap.Reconstruction) -> PointCloud:
+def all_points(model: Reconstruction) -> PointCloud:
     """Return the finite points of a model, in order of ids."""
     return PointCloud(*point_arrays(finite_points(model)))
 
@@ -106,7 +106,7 @@ class LargerViews:
     ) -> None:
         self._photo_dir, self._mask_dir = photo_dir, mask_dir
         with translate_errors("reading the model"):
-            model = pycolmap.Reconstruction(model_dir)
+            model = Reconstruction(model_dir)
             lenses = perspective_lenses(model, max_side_px)
             images = {image.name: image for image in posed_images(model)}
         parts: dict[int, dict[int, PerspectiveView]] = {}

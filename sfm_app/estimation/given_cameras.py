@@ -55,9 +55,7 @@ def assign_cameras(matches: MatchGraph, given: GivenCameras, *, keep: bool) -> A
             cameras[group] = replace(camera, method=KEPT) if keep else camera
             notes += [f"scaled the given camera of the photos {group}: {note}"] if note else []
     if not cameras and rejections:
-        raise InputError(
-            f"{given.source} fits no photo: {rejections[0]}", hint="omit --calibration to estimate the cameras"
-        )
+        raise InputError(f"{given.source} fits no photo: {rejections[0]}", hint="leave --calibration out")
     return AssignedCameras(cameras, (*notes, *rejections))
 
 

@@ -115,9 +115,7 @@ def missing_package(package: str, module: str) -> str:
 def check_writable(model: Model) -> None:
     """Raise a ReconstructionError for a model without triangles and points, or with coordinates that are not finite."""
     if not len(model.surface.vertices):
-        raise ReconstructionError(
-            "there is nothing to write: the model has no points", hint="take more photos with more overlap"
-        )
+        raise ReconstructionError("the model has no points to write", hint="take more photos with more overlap")
     if not np.isfinite(model.surface.vertices).all():
         raise ReconstructionError("coordinates of the model are not finite", hint="run again from the stage `scene`")
 

@@ -255,9 +255,7 @@ def write_marker_page(
     places = places[: max(min(PAGE.max_markers, count - first), 0)]
     if not places:
         size = format_length(side_m)
-        raise ConfigError(
-            f"no marker of {size} fits on {paper}, or none has number {first}", hint="choose smaller ones"
-        )
+        raise ConfigError(f"no marker of {size} fits on {paper}, or none has number {first}", hint="choose others")
     data = _draw(places, side_m * 1000.0, family, first, paper, path.suffix.lower().removeprefix("."))
     try:
         with replace_atomically(path) as target:

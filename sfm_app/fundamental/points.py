@@ -35,9 +35,7 @@ def _check(x: ArrayLike, name: str) -> FloatArray:
         raise ValueError(f"{name} must hold real numbers, got {points.dtype}")
     points = np.ascontiguousarray(points, dtype=np.float64)
     if not np.isfinite(points).all():
-        raise ValueError(
-            f"{name} holds {np.count_nonzero(~np.isfinite(points).all(axis=1))} points that are not finite"
-        )
+        raise ValueError(f"{name} has {np.count_nonzero(~np.isfinite(points).all(axis=1))} points that are not finite")
     if len(points) and np.abs(points).max() > _LARGEST_PX:
         raise ValueError(f"{name} must lie within {_LARGEST_PX:.0e} px, got {np.abs(points).max():.1e}")
     return points

@@ -66,9 +66,7 @@ def is_panorama(picture: DecodedPhoto, upright: Image.Image) -> bool:
         degrees = f"{360 * wide:.0f} x {180 * high:.0f} degrees"
         raise UnreadableError(f"a panorama of {degrees}: only full ones of 360 x 180 degrees can be used")
     if not _is_twice_as_wide(upright.size):
-        raise UnreadableError(
-            "a part of a panorama: its metadata claims the whole sphere, but it is not twice as wide as high"
-        )
+        raise UnreadableError("a part of a panorama that claims the whole sphere")
     return True
 
 

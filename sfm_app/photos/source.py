@@ -94,8 +94,7 @@ class Source:
                 change = "is gone" if stamp is None else "has changed"
                 name = path.relative_to(self.path).as_posix() if path.is_relative_to(self.path) else ""
                 raise InputError(
-                    f"{self.named.get(name, path)} {change} since the run began",
-                    hint="run again once the files are restored",
+                    f"{self.named.get(name, path)} {change} since the run began", hint="restore it and run again"
                 )
 
 

@@ -292,10 +292,7 @@ def _shutter_lines(shutter: Mapping[str, Any]) -> Iterator[str]:
 
 def _adjustment_warnings(adjustment: Mapping[str, Any]) -> Iterator[str]:
     if adjustment.get("failed"):
-        yield (
-            f"beware: the last adjustment failed ({adjustment['failed']}); cameras and poses are those of mapping, "
-            "with unknown errors"
-        )
+        yield (f"beware: the last adjustment failed ({adjustment['failed']}); cameras and poses have unknown errors")
     for number, reason in adjustment.get("failed_in_other_models", {}).items():
         yield f"beware: the last adjustment of other_models/{number} failed ({reason})"
     for name in adjustment.get("cameras_held", ()):
@@ -312,13 +309,12 @@ def _doubt_lines(counts: Mapping[str, Any]) -> Iterator[str]:
     for join in counts.get("perhaps_look_alikes", ()):
         here, there = (list_names(names, NAMES_SHOWN) for names in join["between"])
         yield (
-            f"beware: a loop, or look-alikes: {join['pairs']} pairs match {here} with {there}, "
-            "but no photos between them confirm it"
+            f"beware: a loop, or look-alikes: {join['pairs']} pairs match {here} with {there}, no photos between them"
         )
     for names in counts.get("weakly_joined", ()):
         yield (
-            f"beware: few points determine the distance of {list_names(names, NAMES_SHOWN)} from the rest; "
-            "take more photos between them"
+            f"beware: few points determine the distance of {list_names(names, NAMES_SHOWN)} from "
+            "the rest; take more between"
         )
     for before, after in counts.get("jumps", ()):
         yield f"beware: a jump between the consecutive photos {before} and {after}; in a video, a sign of look-alikes"

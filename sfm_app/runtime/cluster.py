@@ -396,9 +396,7 @@ def connect(settings: ClusterSettings, folder: Path) -> Iterator[Cluster]:
     try:
         import distributed
     except ImportError:
-        raise ConfigError(
-            "a cluster needs Dask, which is not installed", hint="pip install 'sfm-app[cluster]'"
-        ) from None
+        raise ConfigError("a cluster needs Dask", hint="pip install 'sfm-app[cluster]'") from None
     known = [name for name in logging.root.manager.loggerDict if name.startswith("distributed.")]
     for name in ("distributed", "tornado", "asyncio", *known):  # this program reports errors in one line
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
@@ -418,9 +416,7 @@ def connect(settings: ClusterSettings, folder: Path) -> Iterator[Cluster]:
         try:
             client.wait_for_workers(max(1, count), timeout=settings.wait_s)
         except TimeoutError as err:
-            raise ClusterError(
-                f"the scheduler {settings.address} has no workers", hint="start some: see docs/cluster.md"
-            ) from err
+            raise ClusterError(f"the scheduler {settings.address} has no workers", hint="see docs/cluster.md") from err
         yield Cluster(client, folder, settings, limit=count)
 
 

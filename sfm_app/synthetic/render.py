@@ -213,7 +213,7 @@ class Picture:
 
 
 def render_model(prepared: PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
-    """Render the model at a pose (3, 4), unlit in the colors of its texture or else of its vertices, from both sides."""
+    """Render the model at a pose (3, 4), unlit in the colors of its texture or vertices, from both sides."""
     directions = pixel_rays(camera) @ cam_from_world[:, :3]
     return render_rays(prepared, camera_center(cam_from_world), directions.reshape(camera.height, camera.width, 3))
 

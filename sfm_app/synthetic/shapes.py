@@ -335,7 +335,7 @@ def tiles(
 
 @kernel
 def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
-    """Return the shares of the second color (glaze) and of the thin lines on Greek pottery, with bands of one height."""
+    """Return the shares of the second color (glaze) and of thin lines on Greek pottery, in bands of one height."""
     band = p[1] / scale
     row = math.floor(band)
     inside = band - row
