@@ -162,7 +162,7 @@ def _fit_on_ground(
     deviation = np.sqrt(unexplained / max(1.0 - unexplained, 1e-12) / (2 * (count - 2)))
     # for positions unrelated to the cameras, `unexplained` has the distribution function u^(n-2): Beta(n - 2, 1)
     if unexplained ** (count - 2) > OPTIONS.significance or deviation > OPTIONS.max_scale_deviation:
-        return Rejected(f"{used} GPS positions within {extent:.0f} m and residuals of {rms:.1f} m determine no scale")
+        return Rejected(f"{used} GPS positions of {extent:.0f} m with errors of {rms:.1f} m do not determine a scale")
     scale = float(np.abs(a))
     c = a / scale
     R = np.array([[c.real, -c.imag, 0.0], [c.imag, c.real, 0.0], [0.0, 0.0, 1.0]]) @ np.stack([*axes, up])
