@@ -12,6 +12,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from sfm_app.bundle import lens_parts
 from sfm_app.bundle.lens_evidence import (
     LensChoice,
     LensEstimate,
@@ -19,16 +20,6 @@ from sfm_app.bundle.lens_evidence import (
     estimate_lenses,
     family_evidence,
     suggests_other_family,
-)
-from sfm_app.bundle.lens_parts import (
-    COUNT,
-    NO_RULE,
-    PARTS,
-    CameraRule,
-    LensPriors,
-    calibration_from_params,
-    determined_names,
-    fit_to_model,
 )
 from sfm_app.bundle.normal_equations import Bundle, best_step, bundle_scale, cost, elimination_width, reduce
 from sfm_app.camera.models import FILE_MODELS, INDEX, PARAMETERS, file_model, params_of_row, row_of_calibration
@@ -52,7 +43,7 @@ from sfm_app.types.camera import named_correlations
 
 # COLMAP's models as the arrays of our bundle adjustment, and back.
 
-Rules = Mapping[int, CameraRule]
+Rules = Mapping[int, lens_parts.CameraRule]
 """The user's rules, by camera id; cameras without a rule are free."""
 NO_RULES: Rules = MappingProxyType({})
 
@@ -252,15 +243,17 @@ def improve_tracks(model: Reconstruction, graph: pycolmap.CorrespondenceGraph) -
     return abs(int(model.compute_num_observations() - before))
 
 
-def lens_priors(model: Reconstruction, ids: list[int], bundle: Bundle, rules: Rules = NO_RULES) -> LensPriors:
+def lens_priors(
+    model: Reconstruction, ids: list[int], bundle: Bundle, rules: Rules = NO_RULES
+) -> lens_parts.LensPriors:
     """Return the priors of the cameras, before any evidence from the bundle."""
     used = photos_per_camera(model)
     sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
     many = np.array([used[camera_id] >= OPTIONS.min_photos for camera_id in ids])
-    always = [[part.name in ("focal", "k1") for part in PARTS[int(kind)]] for kind in bundle.family]
-    estimated = (many[:, None] | np.array(always).reshape(-1, COUNT)) & (bundle.family != PANORAMA)[:, None]
-    of_cameras = [rules.get(camera_id, NO_RULE) for camera_id in ids]
-    return LensPriors.from_cameras(bundle.params, bundle.family, sizes, estimated, of_cameras)
+    always = [[part.name in ("focal", "k1") for part in lens_parts.PARTS[int(kind)]] for kind in bundle.family]
+    estimated = (many[:, None] | np.array(always).reshape(-1, lens_parts.COUNT)) & (bundle.family != PANORAMA)[:, None]
+    of_cameras = [rules.get(camera_id, lens_parts.NO_RULE) for camera_id in ids]
+    return lens_parts.LensPriors.from_cameras(bundle.params, bundle.family, sizes, estimated, of_cameras)
 
 
 # The camera model that the photos support: other families of a lens, and the ranking of all models.
@@ -308,7 +301,7 @@ def best_families(model: Reconstruction, rounds: Rounds, rules: Rules = NO_RULES
         family, params = int(rounds.bundle.family[row]), rounds.lenses.params[row]
         reach, best = _observed_reach(rounds.bundle, row), rounds.lenses.ranking[row][0]
         many = np.count_nonzero(rounds.bundle.camera == row) >= OPTIONS.min_photos
-        is_open = many and rules.get(camera_id, NO_RULE).family is None
+        is_open = many and rules.get(camera_id, lens_parts.NO_RULE).family is None
         is_doubtful = is_open and suggests_other_family(params, family, reach, best, bool(rounds.lenses.folding[row]))
         other = convert_lens(params, family, reach) if is_doubtful else None
         if other is None:
@@ -472,7 +465,7 @@ def refined_cameras(rounds: Rounds) -> dict[int, RefinedCamera]:
         entries = {name: float(lenses.deviations[row][place]) for name, place in zip(names, places, strict=True)}
         refined[camera_id] = RefinedCamera(
             deviations=finite_entries(entries),
-            determined=determined_names(int(rounds.bundle.family[row]), lenses.determined[row]),
+            determined=lens_parts.determined_names(int(rounds.bundle.family[row]), lenses.determined[row]),
             correlations=named_correlations(names, lenses.mean_squares[row][np.ix_(places, places)]),
         )
     return refined
@@ -504,7 +497,7 @@ def apply_rules(model: Reconstruction, rules: Rules) -> None:
             params, new_family = (before, family) if other is None else (other, new_family)
         parts = None if rule.is_kept else rule.parts(new_family)
         if parts is not None:
-            params = fit_to_model(params, parts, new_family)
+            params = lens_parts.fit_to_model(params, parts, new_family)
         changed = changed or new_family != family or not np.array_equal(params, before)
         write_camera(camera, params, new_family)
     if changed:
@@ -530,8 +523,8 @@ def given_estimates(model: Reconstruction, rounds: Rounds, rules: Rules) -> dict
         if camera_id not in rules or rules[camera_id].given is None or lenses.held[row] or family == PANORAMA:
             continue
         camera = model.cameras[camera_id]
-        determined = determined_names(family, lenses.determined[row])
-        estimates[camera_id] = calibration_from_params(
+        determined = lens_parts.determined_names(family, lenses.determined[row])
+        estimates[camera_id] = lens_parts.calibration_from_params(
             lenses.params[row], family, (camera.width, camera.height), lenses.deviations[row], determined
         )
     return estimates

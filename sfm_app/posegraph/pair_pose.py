@@ -9,18 +9,7 @@ import numpy as np
 from sfm_app.camera.bearings import bearings
 from sfm_app.fundamental.degeneracy import DEGENERACY, dominant_homography, transfer_distance
 from sfm_app.fundamental.refits import solve_cholesky
-from sfm_app.geometry.epipolar import (
-    FIRST,
-    SECOND,
-    cross_matrix,
-    decompose_essential,
-    eight_point,
-    fit_rays,
-    gradients,
-    nearest_essential,
-    pixels_per_radian,
-    rotation_residuals,
-)
+from sfm_app.geometry import epipolar
 from sfm_app.geometry.least_squares import DECREASE, INCREASE, DampingRange
 from sfm_app.geometry.poses import (
     POSE_DOF,
@@ -109,7 +98,7 @@ def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray,
     if min(lengths) <= 1e-12 * max(*lengths, 1e-300):
         return
     roll = np.arctan2(-g2[1], -g2[0]) - np.arctan2(g1[1], g1[0])
-    K = cross_matrix(np.append(g1 / lengths[0], 0.0))
+    K = epipolar.cross_matrix(np.append(g1 / lengths[0], 0.0))
     angles = np.radians(OPTIONS.turns_deg)[:, None, None]
     upright = np.array([[np.cos(roll), -np.sin(roll), 0.0], [np.sin(roll), np.cos(roll), 0.0], [0.0, 0.0, 1.0]])
     turns = upright @ (np.eye(3) + np.sin(angles) * K + (1.0 - np.cos(angles)) * (K @ K))  # Rodrigues
@@ -203,7 +192,7 @@ class Pair:
         """Return R and t from F and the cameras, before refinement."""
         inliers, E = self.lines[fit.inliers], self.essential_matrix(fit)
         chosen = _screen(inliers)
-        poses = decompose_essential(nearest_essential(E))
+        poses = epipolar.decompose_essential(epipolar.nearest_essential(E))
         return max(poses, key=lambda pose: int(np.count_nonzero(is_in_front(chosen, *pose))))
 
     def essential_matrix(self, fit: EpipolarGeometry) -> FloatArray:
@@ -211,12 +200,14 @@ class Pair:
         (first, second), inliers = self.cameras, self.lines[fit.inliers]
         is_wide = any(camera.projection != PERSPECTIVE for camera in self.cameras)
         if is_wide or not isinstance(fit, EpipolarFit):  # by eight points with errors in pixels
-            E = fit_rays(inliers[:, FIRST], inliers[:, SECOND])
+            E = epipolar.fit_rays(inliers[:, epipolar.FIRST], inliers[:, epipolar.SECOND])
             for _ in range(OPTIONS.reweighted_fits):
-                E = fit_rays(inliers[:, FIRST], inliers[:, SECOND], gradients(E, inliers) ** -2.0)
+                E = epipolar.fit_rays(
+                    inliers[:, epipolar.FIRST], inliers[:, epipolar.SECOND], epipolar.gradients(E, inliers) ** -2.0
+                )
             return E
         if first.is_bent or second.is_bent:  # F does not model distortion
-            return eight_point(inliers[:, :2], inliers[:, 9:11])
+            return epipolar.eight_point(inliers[:, :2], inliers[:, 9:11])
         return second.K.T @ fit.F @ first.K
 
     def pose(self, R: FloatArray, t: FloatArray, inliers: BoolArray, *, guided: bool = False) -> RelativePose:
@@ -239,12 +230,12 @@ class Pair:
     def kind(self, used: FloatArray, R: FloatArray, t: FloatArray, angle_deg: float) -> str:
         """Return `RelativePose.kind` by the inliers `used` (N, 18) and their median triangulation angle."""
         within, clear = DEGENERACY.off * self.max_error_px, DEGENERACY.clear_share
-        if angle_deg < OPTIONS.rotation_deg and np.mean(rotation_residuals(used, R) <= within) >= clear:
+        if angle_deg < OPTIONS.rotation_deg and np.mean(epipolar.rotation_residuals(used, R) <= within) >= clear:
             return "rotation"
-        ahead, unit = points_ahead(used), pixels_per_radian(self.lines.reshape(-1, 9))
+        ahead, unit = points_ahead(used), epipolar.pixels_per_radian(self.lines.reshape(-1, 9))
         if len(ahead) < (1.0 - clear) * len(used):
             return "calibrated"
-        H = dominant_homography(np.asfortranarray(ahead), cross_matrix(t) @ R, self.max_error_px / unit)
+        H = dominant_homography(np.asfortranarray(ahead), epipolar.cross_matrix(t) @ R, self.max_error_px / unit)
         on_plane = np.count_nonzero(transfer_distance(H, ahead) <= within / unit)
         return "planar" if on_plane >= clear * len(used) else "calibrated"
 

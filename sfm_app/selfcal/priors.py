@@ -14,14 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sfm_app.camera.models import ASPECT, CENTER, FOCAL, FREE_SHARE, LENS, NARROW, WIDE
-from sfm_app.geometry.least_squares import (
-    NormalPriors,
-    Posteriors,
-    binary_choices,
-    cavity,
-    inverses_of_positive,
-    posteriors,
-)
+from sfm_app.geometry import least_squares
 from sfm_app.selfcal.adjustment import CAMERA, Prior
 from sfm_app.selfcal.pairs import CENTER_U, KAPPA, LOG_ASPECT, LOG_FOCAL
 from sfm_app.types import CameraPrior
@@ -142,7 +135,7 @@ class Evidence:
         prior = self.priors.prior(free, self.thetas)
         precision, offset = prior.precision.ravel(), (prior.mean - self.thetas).ravel()
         share = redundancy(free, self.pairs)
-        covariance = inverses_of_positive(share * self.H + np.diag(precision))
+        covariance = least_squares.inverses_of_positive(share * self.H + np.diag(precision))
         pull = share * self.g + precision * offset
         step = covariance @ pull
         fit = 0.5 * float(pull @ step) - 0.5 * float(precision @ offset**2)
@@ -151,7 +144,7 @@ class Evidence:
 
     def choices(self, free: BoolArray, camera: int) -> BoolArray:
         """Return (K, C, 4) choices for one camera, less free first, without those of too little redundancy."""
-        switches = binary_choices(free.shape[1])
+        switches = least_squares.binary_choices(free.shape[1])
         trials = np.repeat(free[None], len(switches), axis=0)
         trials[:, camera] = switches
         allowed = [k == 0 or redundancy(trial, self.pairs) >= PRIORS.least_redundancy for k, trial in enumerate(trials)]
@@ -191,17 +184,17 @@ class Evidence:
 
     def camera_posteriors(
         self, free: BoolArray, camera: int, step: FloatArray, covariance: FloatArray
-    ) -> tuple[BoolArray, Posteriors]:
+    ) -> tuple[BoolArray, least_squares.Posteriors]:
         """Return all choices (K, C, 4) for one camera, and its posteriors; `step` and `covariance` are of `free`."""
         block = slice(CAMERA * camera, CAMERA * (camera + 1))
         prior, trials = self.priors.prior(free, self.thetas), self.choices(free, camera)
         offset = prior.mean - self.thetas
-        H, g = cavity(covariance[block, block], step[block], prior.precision[camera], offset[camera])
+        H, g = least_squares.cavity(covariance[block, block], step[block], prior.precision[camera], offset[camera])
         others = [self.priors.prior(trial, self.thetas) for trial in trials]
         scale = np.array([redundancy(trial, self.pairs) for trial in trials]) / redundancy(free, self.pairs)
-        posterior = posteriors(
+        posterior = least_squares.posteriors(
             scale[:, None, None] * H, scale[:, None] * g,
-            NormalPriors(
+            least_squares.NormalPriors(
                 np.array([other.precision[camera] for other in others]),
                 np.array([(other.mean - self.thetas)[camera] for other in others]),
                 np.array([self.priors.log_odds(trial) for trial in trials]),
