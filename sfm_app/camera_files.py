@@ -406,11 +406,7 @@ RUN_FILES = ("scene.json", "calibration.json")
 
 
 def read_given_cameras(path: Path) -> GivenCameras:
-    """Read a calibration file of any known form, or a folder that holds one.
-
-    Raises:
-        InputError: it is missing, of no known form, or holds values that are no camera.
-    """
+    """Read a calibration file of any known form, or a folder that holds one; an InputError says what is wrong."""
     try:
         form, (cameras, camera_of) = _read_folder(path) if path.is_dir() else _read_file(path)
         if not cameras:

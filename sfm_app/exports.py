@@ -284,10 +284,7 @@ ELSEWHERE = "name another place with -o"
 
 @contextmanager
 def fill_folder(target: Path, about: Callable[[], Mapping[str, object]]) -> Iterator[Path]:
-    """Provide an empty folder beside `target`, which replaces it when the block ends without an error.
-
-    The target may be an earlier export; `about` returns the entries of the record besides the files, at the end.
-    """
+    """Provide an empty folder that replaces `target` at the end, with a record of `about` and its files."""
     check_replaceable(target)
     with replace_folder(target) as draft:
         yield draft

@@ -112,13 +112,7 @@ def file_model(row: FloatArray, family: int) -> str:
 
 
 def calibration_from_model(model: str, params: Sequence[float], size: tuple[int, int]) -> Calibration:
-    """Return the camera with a model and parameters of COLMAP, as given by the user.
-
-    Lengths are in pixels; the size of the photos is (0, 0) where unknown.
-
-    Raises:
-        ValueError: the model is not supported, or the parameters are no camera.
-    """
+    """Return the camera of a model and parameters of COLMAP; size (0, 0) if unknown, ValueError if it is none."""
     names = PARAMETERS.get(model)
     if names is None:
         raise ValueError(f"the camera model {model} is not supported: only {', '.join(PARAMETERS)}")

@@ -78,12 +78,7 @@ def versions() -> dict[str, str]:
 
 @contextlib.contextmanager
 def translate_errors(doing: str) -> Iterator[None]:
-    """Turn COLMAP's exceptions into a BackendError that names the operation; our own errors pass through.
-
-    Raises:
-        BackendError: COLMAP failed.
-        NumericalError: NumPy failed, or our own computation did.
-    """
+    """Turn exceptions of COLMAP into a BackendError that names the operation, of NumPy into a NumericalError."""
     try:
         yield
     except (SfmError, OSError):

@@ -505,10 +505,7 @@ def apply_rules(model: Reconstruction, rules: Rules) -> None:
 
 
 def given_estimates(model: Reconstruction, rounds: Rounds, rules: Rules) -> dict[int, Calibration]:
-    """Return estimates of the user's cameras by id, if the photos determine them.
-
-    If one is kept, everything is adjusted once more with free cameras, to the same tracks.
-    """
+    """Return estimates of the user's cameras by id, if the photos determine them; kept ones are adjusted again."""
     if all(rule.given is None for rule in rules.values()):
         return {}
     if any(rule.is_kept for rule in rules.values()):

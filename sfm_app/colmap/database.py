@@ -90,10 +90,7 @@ def remove_database(path: Path) -> None:
 
 
 def create_database(path: Path, photos: PhotoSet) -> None:
-    """Make a database of photos and cameras in a fixed order.
-
-    Feature extraction would enter them in the order in which its threads finish, which differs from run to run.
-    """
+    """Make a database of photos and cameras in a fixed order, which threads of feature extraction would not keep."""
     images = {key: matched_image(key, photo) for key, photo in enumerate(ordered_photos(photos), start=1)}
     write_match_graph(path, MatchGraph(images, {}, {}))
 

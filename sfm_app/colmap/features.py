@@ -110,11 +110,7 @@ def _extraction_options(settings: SiftSettings, workers: int) -> Extraction:
 def _find_in_photos(
     sizes: Mapping[str, Size], settings: SiftSettings, extraction: Extraction, token: Token
 ) -> dict[str, SiftFeatures]:
-    """Return the features of photos by name.
-
-    The number of features grows with the area. Photos with half of `enlarge_below` or more get twice the area, those
-    with fewer twice the size.
-    """
+    """Return the features of photos by name, of photos with few after enlarging them."""
     options, masks = settings.options, settings.masks
     features = _drop_masked(_extract(settings.photos, sizes, extraction, token), masks)
     if settings.sift:

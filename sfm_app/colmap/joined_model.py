@@ -55,11 +55,7 @@ def read_placed(model_dir: Path) -> PlacedPhotos:
 
 
 def write_placed(database: Path, placed: PlacedPhotos) -> Reconstruction:
-    """Return poses and points as COLMAP's model, with the photos of a database.
-
-    Of the cameras of photos that share one in the database, the camera with the median focal is taken. Each keypoint is
-    in one point at most.
-    """
+    """Return poses and points as COLMAP's model, with the photos of a database and cameras of median focal."""
     model = unposed_model(database)
     _write_cameras(model, placed)
     for photo, R, center in zip(placed.photos.tolist(), placed.R, placed.centers, strict=True):

@@ -89,11 +89,7 @@ def _map_in_process(
 def incremental_options(
     seed: int, *, known: bool = False, kept: Collection[int] = ()
 ) -> backend.pycolmap.IncrementalPipelineOptions:
-    """Return COLMAP's defaults, except that two photos make a model and only the given model is extended.
-
-    Adjustments stop when they gain little: the last adjustment is ours. With known cameras, poses and points alone
-    converge in a few steps. Cameras in `kept` do not change.
-    """
+    """Return COLMAP's defaults, except that two photos make a model, which converges coarsely; `kept` cameras stay."""
     options = backend.pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 2
     options.multiple_models = False

@@ -40,10 +40,7 @@ def global_options(seed: int, names: Sequence[str]) -> pycolmap.GlobalPipelineOp
 
 
 def map_with_defaults(scratch: Path, photo_dir: Path, seed: int) -> None:
-    """Verify the raw matches, map them with COLMAP's defaults, and write the largest model into `model`.
-
-    Only seeds and the number of threads differ from the defaults: on several threads, results differ between runs.
-    """
+    """Verify and map raw matches with COLMAP's defaults but seeds and one thread; write the largest model."""
     database = scratch / "database.db"
     geometry = pycolmap.TwoViewGeometryOptions()
     geometry.ransac.random_seed = seed

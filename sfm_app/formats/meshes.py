@@ -119,10 +119,7 @@ MATERIAL = "newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum {light}\n"
 
 
 def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
-    """Write triangles with normals and a texture or a color per vertex, or else points; and cameras, if any, as lines.
-
-    The files are the OBJ and, with a texture, the MTL, a JPEG per page, and the normal map, if any.
-    """
+    """Write triangles with texture or colors, else points, and cameras as lines: OBJ, MTL, a JPEG per page."""
     check_writable(model)
     pages = page_files(model, name)
     text = ["# sfm_app\n", *_vertex_lines(model, with_colors=not pages)]

@@ -167,10 +167,7 @@ def write_opencv(scene: FinishedScene, target: Path) -> None:
 
 
 def opencv_lens(camera: CameraModel) -> tuple[str, FloatArray]:
-    """Return OpenCV's name of the lens, and its coefficients: k1 k2 p1 p2 k3 k4 k5 k6, or four of a fisheye.
-
-    ValueError if OpenCV has no such lens.
-    """
+    """Return OpenCV's name and coefficients of the lens, 8 or, of a fisheye, 4; ValueError if it has no such lens."""
     projection, terms = projection_of_model(camera.model), row_of_model(camera.model, camera.params)[K1:]
     if projection == EQUIRECTANGULAR:
         raise ValueError("OpenCV has no model of a panorama")

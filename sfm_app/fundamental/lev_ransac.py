@@ -97,11 +97,7 @@ def search_patience(points: FloatArray, F: FloatArray, threshold: float) -> floa
 
 
 def _optimize_locally(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Fit by 8 points to the matches within twice the threshold, then step on the Sampson distance at both scales.
-
-    A model through seven noisy matches misses many true ones by more than the threshold; a fit to the wider set reaches
-    them (Chum, Matas and Kittler 2003).
-    """
+    """Fit to the matches within twice the threshold, then refine at both scales (Chum, Matas and Kittler 2003)."""
     squared = squared_distances(points, np.ascontiguousarray(F).reshape(9))
     near = np.flatnonzero(squared <= (OPTIONS.sampson_reach * threshold) ** 2)[: OPTIONS.local_matches]
     nearby, wide = np.asfortranarray(points[near]), squared[near] <= (OPTIONS.algebraic_reach * threshold) ** 2

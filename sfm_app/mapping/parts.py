@@ -125,11 +125,7 @@ def part_size(photos: int, options: SceneSettings) -> int:
 def map_in_parts(
     group: Group, mapped: PoseGraph, run: RunContext, *, stop_at_false_joins: bool = True
 ) -> tuple[list[MappingResult], tuple[LookAlikes, ...]]:
-    """Return the results of mapping a group in parts, or else the false joins within parts, which stop the mapping.
-
-    A group of one part gives neither. `mapped` is the pose graph with the pairs that mapping follows; it is in the
-    database of the run.
-    """
+    """Return the results of mapping a group in parts, or else the false joins within parts, which stop the mapping."""
     parts = cut_group(group.graph, group.photos, part_size(len(group.photos), run.settings.scene))
     if len(parts) < 2:
         return [], ()

@@ -152,11 +152,7 @@ def _preview(
 
 
 def match_probable_pairs(method: FeatureMethod, load: Callable[[], MatchGraph], run: RunContext) -> None:
-    """Match pairs of photos that look alike or lie beside each other, then pairs that these suggest.
-
-    Pairs of photos of an earlier run keep their matches. `load` reads the match graph as it is now. Errors as of
-    `fill_database`.
-    """
+    """Match pairs of photos that look alike or lie beside each other, then pairs that these suggest."""
     initial = load()
     known = run.earlier.known if run.earlier is not None else frozenset[str]()
     new = {photo for photo, image in initial.images.items() if image.name not in known}

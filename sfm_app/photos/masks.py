@@ -52,10 +52,7 @@ def list_masks(masks: str, photos: Path, out: Path) -> list[str]:
 
 
 def assign_masks(photos: Sequence[Photo], names: Collection[str], *, for_all: bool = False) -> list[Photo]:
-    """Return the photos with the names of their masks; empty names where they have none.
-
-    The one file of `for_all` is the mask of all, and so is one that is alone in its folder and has no photo's name.
-    """
+    """Return the photos with their masks, empty without; one of `for_all`, or alone in its folder, masks all."""
     visible = {name for name in names if not PurePosixPath(name).name.startswith(".")}
     assigned = [replace(photo, mask=_find_mask(photo.path, visible)) for photo in photos]
     is_alone = len(visible) == 1 and "/" not in "".join(visible) and not any(photo.mask for photo in assigned)

@@ -155,10 +155,7 @@ def _fingerprint_reading(options: PhotoSettings) -> str:
 
 
 def drop_duplicates(stats: Sequence[PhotoStats]) -> tuple[list[Photo], list[UnusablePhoto]]:
-    """Return one photo per picture, and its copies, in the given order.
-
-    Photos with a mask stay, then those of more pixels, with EXIF, and of larger files.
-    """
+    """Return one photo per picture, masked, large, with EXIF or of many bytes, and its copies, in the given order."""
     from scipy.spatial import cKDTree
 
     photos = [one.photo for one in stats]

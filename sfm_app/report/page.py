@@ -59,10 +59,7 @@ def three_script() -> str:
 
 
 def finish_report(run: RunContext, problem: SfmError | None = None) -> Path | None:
-    """Note how a run ended, and write its report; a failure here does not end the run.
-
-    The result is None if no run has begun in the folder, or another run is using it.
-    """
+    """Note how a run ended, and write its report; None if no run has begun, or another one is at work."""
     place = run.workspace
     if not (place.root / LOCK).exists():
         return None

@@ -261,10 +261,7 @@ class Workspace:
 
     @contextlib.contextmanager
     def hold_lock(self) -> Iterator[None]:
-        """Hold the lock that keeps other runs out (InputError) until the block, or this process, ends.
-
-        A block inside another one of the same object changes nothing.
-        """
+        """Hold the lock that keeps other runs out (InputError) until the outermost block, or this process, ends."""
         if self._is_held:
             yield
             return
@@ -298,10 +295,7 @@ class Workspace:
                 file.touch()
 
     def check_exists(self) -> None:
-        """Check that the folder still exists during a run, and is writable.
-
-        A removed folder with new files of this run is marked as made by a run: otherwise the next run would refuse it.
-        """
+        """Check that the folder still exists during a run, and is writable; if it was made again, it stays a run's."""
         if not (self.root / LOCK).exists():
             names = {path.name for path in self.root.iterdir()} if self.root.is_dir() else set()
             if names and names <= {*LINK_CHECKED, PHOTO_SET, VIEW_GRAPH}:

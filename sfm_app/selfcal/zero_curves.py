@@ -67,13 +67,7 @@ ZERO_CURVES = ZeroCurveOptions()
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Find the K that most pairs agree on, and the lens; an estimate or a guess where the pairs do not determine K.
-
-    Without inliers no lens is found, and the standard deviations come from resampling the pairs.
-
-    Raises:
-        ValueError: malformed input, see `selfcal.pairs.prepare`.
-    """
+    """Find the K that most pairs agree on, and the lens; a guess where the pairs do not determine K."""
     usable = _prepare(pairs)
     evidence = {"pairs": float(len(usable))}
     if len(usable) < LEAST_PAIRS:

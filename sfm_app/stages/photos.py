@@ -72,11 +72,7 @@ def _marker(run: RunContext, name: str) -> Path:
 
 @contextmanager
 def gathered_frames(source: Source, run: RunContext) -> Iterator[tuple[dict[str, float], list[UnusablePhoto]]]:
-    """Fill OUT/frames with the photos of several inputs and the frames of their videos, which are as in `video_frames`.
-
-    The videos share `max_frames` by their stated durations, or evenly where one states none. Also provide those that
-    cannot be used.
-    """
+    """Fill OUT/frames with photos and the frames of videos, as in `video_frames`; also provide unusable ones."""
     times_s, refused, counts = dict[str, float](), list[UnusablePhoto](), dict[str, Mapping[str, Any]]()
     if not any(read_choice(run, _marker(run, name)) for name in source.videos):
         shutil.rmtree(run.workspace.frames, ignore_errors=True)

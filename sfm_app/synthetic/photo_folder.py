@@ -88,11 +88,7 @@ def write_photo_folder(
     folder: Path, scene: SyntheticScene, views: Views, options: PhotoOptions | None = None, processes: int = 1,
     progress: Progress | None = None,
 ) -> Truth:  # fmt: skip
-    """Render the missing photos of a folder, a JPEG without EXIF per view; `save_truth` writes the truth elsewhere.
-
-    Other photos of the folder must be of the same scene, views and options, which is not checked. A script with more
-    than one process needs a `__main__` guard.
-    """
+    """Render the missing photos of a folder, a JPEG without EXIF per view; `save_truth` writes the truth elsewhere."""
     missing = [k for k, name in enumerate(views.cam_from_world) if not (folder / name).exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)

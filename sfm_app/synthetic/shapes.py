@@ -278,10 +278,7 @@ def octaves(p: tuple[float, float, float], size: float, gain: float, footprint: 
 
 @kernel
 def cells(a: float, b: float, seed: int) -> tuple[float, float]:
-    """Return border distance and number of the cell at a point, for random cells in the plane.
-
-    The distance is in cells; the number, in [0, 1), identifies the cell.
-    """
+    """Return border distance and number, in [0, 1), of the cell at a point, for random cells in the plane."""
     ia, ib = math.floor(a), math.floor(b)
     first, second, name = 9.0, 9.0, 0.0
     for i in range(ia - 1, ia + 2):

@@ -101,11 +101,7 @@ def _cameras(thetas: FloatArray) -> FloatArray:
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Minimize (5.8), or `constraint_form`, from K_init with equal weights.
-
-    The weights show which pairs take part (> 0), and count in the verdict only. Returns and raises as
-    `verdict.calibrate_with`; the seed is unused.
-    """
+    """Minimize (5.8), or `constraint_form`, from K_init with equal weights; the given ones select pairs."""
     del seed
     return calibrate_with(METHOD, pairs, partial(_find_camera, equations=EQUATIONS[options.constraint_form]))
 

@@ -21,11 +21,7 @@ TOLERANCE = 1e-6
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Minimize (5.8), or `constraint_form`, repeatedly, with weights from the error discrepancy (thesis Algorithm 3).
-
-    The weights show which pairs take part (> 0), and count in the verdict only. Returns and raises as
-    `verdict.calibrate_with`; the seed is unused.
-    """
+    """Minimize (5.8), or `constraint_form`, with weights from the error discrepancy (thesis Algorithm 3)."""
     del seed
     return calibrate_with(METHOD, pairs, partial(algorithm_3, equations=EQUATIONS[options.constraint_form]))
 
