@@ -44,12 +44,8 @@ class PhotoSettings(Section):
     """Photos, and cameras that they share."""
 
     images: str = Field("", description="text file that names the photos to use, one per line; all where empty")
-    masks: str = Field(
-        "", description="folder of masks, such as sub/a.jpg.png, or one for all photos; black is left out"
-    )
-    positions: str = Field(
-        "", description="positions of photos, as OpenDroneMap's geo.txt; if empty, geo.txt beside them"
-    )
+    masks: str = Field("", description="folder of masks, such as sub/a.jpg.png, or one for all; black is left out")
+    positions: str = Field("", description="positions, as OpenDroneMap's geo.txt; if empty, geo.txt beside the photos")
     cameras: Literal["auto", "single", "folder", "each"] = Field(
         "auto",
         description="auto: same size and EXIF camera share one; single: all do; folder: those of a folder; each: none",
@@ -100,15 +96,11 @@ class CalibrationSettings(Section):
     lens: bool = Field(True, description="estimate the radial distortion of the lens")
     file: str = Field("", description="file or folder of known cameras, as of COLMAP or OpenCV; none where empty")
     keep: bool = Field(False, description="keep the cameras of the calibration file as they are")
-    priors: str = Field(
-        "auto", description="method that guesses cameras from photos; auto: an installed one; none: only EXIF"
-    )
+    priors: str = Field("auto", description="guesses cameras from photos; auto: an installed one; none: only EXIF")
     deviation: float = Field(
-        0.0, ge=0, le=1, description="standard deviation of the file's focals, as a share; 0: they are used"
+        0.0, ge=0, le=1, description="deviation of the file's focals, as a share; 0: they are used"
     )
-    center_sigma: float = Field(
-        0.15, gt=0, le=10, description="prior deviation of the optical center from the middle, in image widths"
-    )
+    center_sigma: float = Field(0.15, gt=0, le=10, description="deviation of the center from the middle, in widths")
 
 
 HypothesisName = Literal[
@@ -229,9 +221,7 @@ class MeshSettings(Section):
         description="longer side of the photos that refine the surface, in pixels; 0: no refinement",
     )
     faces: int = Field(200_000, ge=100, le=50_000_000, description="most triangles of the mesh or of a block")
-    block_points: int = Field(
-        4_000_000, ge=1000, le=1_000_000_000, description="most points in one mesh; else in blocks"
-    )
+    block_points: int = Field(4_000_000, ge=1000, le=1_000_000_000, description="most points in one mesh")
 
 
 class TextureSettings(Section):

@@ -100,9 +100,7 @@ class Program(click.Group):
                 sys.stderr.flush()
                 os._exit(INTERRUPTED)
 
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
         """Find the command; if the user names a folder instead, suggest `sfm-app run`."""
         try:
             return super().resolve_command(ctx, args)

@@ -448,11 +448,7 @@ def _refit_reprojection(points: FloatArray, F: FloatArray, threshold: float) -> 
     return F if len(inliers) < 8 else refine_reprojection(inliers, refit_sampson(points, F, threshold))
 
 
-REFITS: dict[str, Refit] = {
-    "eight-point": _refit_eight_point,
-    "sampson": refit_sampson,
-    "reprojection": _refit_reprojection,
-}
+REFITS = {"eight-point": _refit_eight_point, "sampson": refit_sampson, "reprojection": _refit_reprojection}
 """Values of `EpipolarSettings.refit` besides "auto"."""
 
 

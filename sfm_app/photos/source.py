@@ -93,9 +93,7 @@ class Source:
             if stamp != self.stamps[path]:
                 change = "is gone" if stamp is None else "has changed"
                 name = path.relative_to(self.path).as_posix() if path.is_relative_to(self.path) else ""
-                raise InputError(
-                    f"{self.named.get(name, path)} {change} since the run began", hint="restore it and run again"
-                )
+                raise InputError(f"{self.named.get(name, path)} {change} since the run began", hint="restore it")
 
 
 def read_source(path: Path, out: Path, options: PhotoSettings, spread: ParallelMap) -> Source:

@@ -317,7 +317,7 @@ def lay_out_photo(photo: Photo, *, folder: Path, target: Path) -> None:
         lay_out(photo, folder, target)
     except UnreadableError as err:
         raise InputError(
-            f"{photo.label} has changed while it was read: {err}", hint="run again once its files are restored"
+            f"{photo.label} has changed while it was read: {err}", hint="restore it and run again"
         ) from err
 
 
