@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -21,8 +20,7 @@ if TYPE_CHECKING:
 # photos are the neighbors, which add no parallax; less similar photos of the same place hold a model together.
 
 
-@dataclass(frozen=True, slots=True)
-class RetrievalOptions:
+class OPTIONS:
     """Choice of partners, previews and vocabulary."""
 
     nearest_share: float = 0.4
@@ -40,7 +38,6 @@ class RetrievalOptions:
     """Descriptors from which a word is learned, on average. Chosen by hand."""
 
 
-OPTIONS = RetrievalOptions()
 BLOCK = 256
 """Photos whose keypoints or similarities are in memory at once; no result depends on it. Chosen by hand."""
 

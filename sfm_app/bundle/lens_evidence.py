@@ -27,8 +27,7 @@ neighboring observations are correlated. Chosen on photo sets with known cameras
 (docs/algorithms/bundle-adjustment.md)."""
 
 
-@dataclass(frozen=True, slots=True)
-class LensOptions:
+class OPTIONS:
     """Limits of the estimate and of the choice of a family."""
 
     undetermined_share: float = 0.5
@@ -55,9 +54,6 @@ class LensOptions:
     """Radii at which a lens is fitted to another. Chosen by hand."""
     least_reach: float = 0.2
     """Smallest share of the observed radius up to which a lens must not fold to be tried as another. Chosen by hand."""
-
-
-OPTIONS = LensOptions()
 
 
 @dataclass(frozen=True, slots=True)

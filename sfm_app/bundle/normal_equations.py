@@ -26,8 +26,7 @@ BLOCK = 6
 """Unknowns of a block of sparse matrices: a pose, or half of a camera."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReductionOptions:
+class REDUCTION:
     """Limits of the reduction (docs/algorithms/bundle-adjustment.md)."""
 
     min_information: float = 1e-11
@@ -45,9 +44,6 @@ class ReductionOptions:
     """Residual above which an observation is lost, i.e. not used; a lost observation costs as much. Chosen by hand."""
     max_derivative: float = 1e60
     """Derivative above which an observation is lost. Chosen by hand."""
-
-
-REDUCTION = ReductionOptions()
 
 
 def whiten_points(by_point: FloatArray, point: IndexArray, points: int) -> tuple[FloatArray, IndexArray]:

@@ -283,8 +283,7 @@ def _residuals(model: ShutterBundle) -> tuple[FloatArray, BoolArray]:
     return r, usable_mask(model.bundle, r, projected.depth)
 
 
-@dataclass(frozen=True, slots=True)
-class ReadoutOptions:
+class OPTIONS:
     """Limits of the adjustment of the readout."""
 
     steps: int = 12
@@ -302,9 +301,6 @@ class ReadoutOptions:
     """Number of offsets that the photos must determine before their size changes. Chosen by hand."""
     shake_converged: float = 1.1
     """Factor by which the size of offsets may still change when the steps end. Chosen by hand."""
-
-
-OPTIONS = ReadoutOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,8 +13,7 @@ from sfm_app.camera.models import camera_matrix
 from sfm_app.types.arrays import Float32Array, FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class ViewOptions:
+class OPTIONS:
     """Sizes of perspective views."""
 
     most_field_deg: float = 95.0
@@ -23,9 +22,6 @@ class ViewOptions:
     """Angle beyond the view's own part: windows and triangles at the border are whole in one view. Chosen by hand."""
     cube_field_deg: float = 300.0
     """Horizontal field above which a photo is a panorama, with views through the faces of a cube. Chosen by hand."""
-
-
-OPTIONS = ViewOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,7 +3,7 @@
 import json
 import logging
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,8 +35,7 @@ from sfm_app.types.camera import EQUIRECTANGULAR
 logger = logging.getLogger("sfm_app")
 
 
-@dataclass(frozen=True, slots=True)
-class CalibratingOptions:
+class OPTIONS:
     """Pairs that calibrate, and inliers through a lens."""
 
     min_radial: float = 0.02
@@ -49,9 +48,6 @@ class CalibratingOptions:
     """Least partners of each photo in a sample of more. Chosen by hand."""
     lens_rounds: int = 2
     """Times that inliers are chosen through the lens so far. Chosen on `benchmarks.lenses.distortion`."""
-
-
-OPTIONS = CalibratingOptions()
 
 
 # Inliers through a lens (ours). A fundamental matrix of pixels keeps the matches that a lens bends least, and cameras

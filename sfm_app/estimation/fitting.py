@@ -33,8 +33,7 @@ METHOD = "lens"
 """Source of a camera: curved epipolar lines."""
 
 
-@dataclass(frozen=True, slots=True)
-class LensOptions:
+class LENS:
     """A fisheye as a camera of COLMAP."""
 
     max_deviation: float = 0.01
@@ -44,8 +43,6 @@ class LensOptions:
     angles: int = 200
     """Angles at which the terms are fitted. Chosen by hand."""
 
-
-LENS = LensOptions()
 
 NONE_KNOWN: Mapping[str, Calibration | None] = MappingProxyType({})
 

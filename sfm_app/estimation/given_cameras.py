@@ -121,8 +121,7 @@ def _choose_name(group: str, images: Sequence[MatchedImage], given: GivenCameras
 # Checks of given cameras against the photos.
 
 
-@dataclass(frozen=True, slots=True)
-class CheckOptions:
+class OPTIONS:
     """When photos contradict a stated camera. Chosen by hand."""
 
     sigmas: float = 3.0
@@ -135,9 +134,6 @@ class CheckOptions:
     """Largest compared angle: the corners hold few matches."""
     angles: int = 20
     """Number of compared angles."""
-
-
-OPTIONS = CheckOptions()
 
 
 CENTERS = ("optical center, across", "optical center, down")

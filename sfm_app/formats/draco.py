@@ -5,7 +5,7 @@ triangles only: points and cameras stay uncompressed.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,8 +22,7 @@ COLOR_ID = 7
 """Draco's number of the attribute with colors; Draco counts its own from 0. By definition."""
 
 
-@dataclass(frozen=True, slots=True)
-class DracoOptions:
+class OPTIONS:
     """Precision of the compressed values."""
 
     position_bits: int = 20
@@ -35,9 +34,6 @@ class DracoOptions:
     """Bits of a texture coordinate: a quarter pixel of the largest page. Chosen by hand."""
     level: int = 7
     """Compression from 0 (fast) to 10 (small); Draco's own tools use 7. By definition."""
-
-
-OPTIONS = DracoOptions()
 
 
 def write_draco(model: Model, name: str) -> Mapping[str, bytes]:

@@ -302,8 +302,7 @@ def _sigma(distances: FloatArray) -> float:
 # Mistakes that explain why points fit badly, or lie in another place than the photos.
 
 
-@dataclass(frozen=True, slots=True)
-class MistakeOptions:
+class MISTAKES:
     """Constants of the search for mistakes, chosen by hand."""
 
     max_share: float = 0.01
@@ -318,9 +317,6 @@ class MistakeOptions:
     """How far points may lie outside of the area of their system: half a zone of UTM."""
     max_away_m: float = 5000.0
     """How far points may lie from the GPS positions of the photos."""
-
-
-MISTAKES = MistakeOptions()
 
 
 def find_mistake(

@@ -17,8 +17,7 @@ MIN_POSITIONS = 3
 """Least number of distinct positions that must agree."""
 
 
-@dataclass(frozen=True, slots=True)
-class GpsOptions:
+class OPTIONS:
     """Constants of the fit to GPS positions."""
 
     max_residual_m: float = 10.0
@@ -38,9 +37,6 @@ class GpsOptions:
     max_pairs: int = 500
     min_swap_gain: float = 2.0
     """Least factor by which swapping latitude and longitude reduces the residuals of a file that has them swapped."""
-
-
-OPTIONS = GpsOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -35,8 +35,7 @@ UNKNOWNS = 9
 """Eight of a homography, and the shift of all edges towards their dark side. By definition."""
 
 
-@dataclass(frozen=True, slots=True)
-class MarkerOptions:
+class OPTIONS:
     """Constants of the fit of patterns to photos."""
 
     along: tuple[float, ...] = (0.25, 0.5, 0.75)
@@ -58,8 +57,6 @@ class MarkerOptions:
     """Largest distance of a corner from the square, in sides. Chosen by hand: a wrong detection, or one number in two
     places, is off by a side or more."""
 
-
-OPTIONS = MarkerOptions()
 
 # Corners, to a few hundredths of a pixel by all edges of the pattern.
 # Detectors look for the outer contour. Blur and the camera's tone curve move every edge towards its dark side, so that
@@ -226,8 +223,7 @@ PAGES_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)
 """Width and height of a sheet of paper, by its name."""
 
 
-@dataclass(frozen=True, slots=True)
-class PageOptions:
+class PAGE:
     """Layout of a page of markers."""
 
     margin_mm: float = 10.0
@@ -236,9 +232,6 @@ class PageOptions:
     ruler_mm: float = 100.0
     """Length of the ruler to check the printer by."""
     max_markers: int = 12
-
-
-PAGE = PageOptions()
 
 
 def write_marker_page(

@@ -15,8 +15,7 @@ from sfm_app.types import Photo
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 
-@dataclass(frozen=True, slots=True)
-class SightOptions:
+class OPTIONS:
     """Constants of points in the model, by their marks in photos."""
 
     max_residual_px: float = 6.0
@@ -35,9 +34,6 @@ class SightOptions:
     """Least standard deviation of a place picked on a surface. Chosen by hand."""
     max_points: int = 200_000
     """Largest number of points of a model among which the nearest to a place are sought."""
-
-
-OPTIONS = SightOptions()
 
 
 @dataclass(frozen=True, slots=True)

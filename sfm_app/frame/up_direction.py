@@ -19,8 +19,7 @@ LINES, ROLL, GROUND, GPS = "vanishing lines", "camera roll", "ground plane", "GP
 WALL, CAMERAS = "wall", "cameras"
 
 
-@dataclass(frozen=True, slots=True)
-class UpOptions:
+class OPTIONS:
     """Constants of the up direction and of the frame of viewers."""
 
     samples: int = 1000
@@ -47,9 +46,6 @@ class UpOptions:
     """Largest angle by which a front is turned to face the viewer; a view of a corner is kept."""
     quantiles: tuple[float, float] = (0.2, 0.8)
     """Quantiles of the points with the middle of the scene halfway between them."""
-
-
-OPTIONS = UpOptions()
 
 
 def dominant_plane(

@@ -4,7 +4,6 @@ A line segment in a photo and the camera center span a plane that contains the d
 the unit normal of the plane represents a segment, and the segments of all posed photos vote together.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -14,8 +13,7 @@ from sfm_app.geometry.poses import axis_angle_deg, component_along, normalize, p
 from sfm_app.types.arrays import ByteArray, FloatArray, IndexArray
 
 
-@dataclass(frozen=True, slots=True)
-class LineOptions:
+class OPTIONS:
     """Constants of line segments and vanishing directions."""
 
     longer_side_px: int = 1000
@@ -41,9 +39,6 @@ class LineOptions:
     """Directions closer than this are the same."""
     min_sine: float = 0.05
     """Least sine of the angle between a segment and its vanishing point; bounds the weight of closer segments."""
-
-
-OPTIONS = LineOptions()
 
 
 def line_segments(gray: ByteArray) -> FloatArray:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,8 +18,7 @@ from sfm_app.types import EpipolarFit, EpipolarGeometry, Rejected
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 
-@dataclass(frozen=True, slots=True)
-class DegeneracyOptions:
+class DEGENERACY:
     """When matches count as degenerate."""
 
     off: float = 2.0
@@ -43,9 +42,6 @@ class DegeneracyOptions:
     Mismatches on rows of bricks agree with a vanishing point as epipole far more often than by chance."""
     rotation_tolerance: float = 0.05
     """Largest relative stretch of a rotation's homography, for some focal length. Chosen by hand."""
-
-
-DEGENERACY = DegeneracyOptions()
 
 
 # Dominant plane: the plane with most of a model's inliers, and the matches off it. Hartley and Zisserman (2004),
@@ -336,8 +332,7 @@ SAME_PHOTO = "the same photo twice, or nearly"
 ONLY_A_LOGO = "nothing in common but a logo or time stamp"
 
 
-@dataclass(frozen=True, slots=True)
-class WatermarkOptions:
+class WATERMARK:
     """When matches that stay in place are no part of the scene."""
 
     peak: float = 1.0
@@ -357,9 +352,6 @@ class WatermarkOptions:
     """Share of the cells with keypoints that a logo does not exceed. Chosen by hand."""
     explained_share: float = 0.9
     """Share of the stationary matches that a motion without rotation explains. Chosen by hand."""
-
-
-WATERMARK = WatermarkOptions()
 
 
 def find_stationary(x1: FloatArray, x2: FloatArray, unit_px: float = 1.0) -> BoolArray:

@@ -8,7 +8,6 @@ models optimized on all matches nearby. Fine scales distinguish the true geometr
 """
 
 import math
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -31,8 +30,7 @@ from sfm_app.types import EpipolarFit, Rejected
 from sfm_app.types.arrays import FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class LevRansacOptions:
+class OPTIONS:
     """Scales and limits, chosen together on the Strecha sets (docs/algorithms/lev-ransac.md).
 
     `python -m benchmarks.fundamental --real DATA --ablation` measures the parts they belong to.
@@ -65,9 +63,6 @@ class LevRansacOptions:
     pairs with two motions: `python -m benchmarks.fundamental --two-motions 100`."""
     least_inliers: int = 8
     """Fewer are no evidence: a model always goes through seven. Chosen by hand."""
-
-
-OPTIONS = LevRansacOptions()
 
 
 def search_patience(points: FloatArray, F: FloatArray, threshold: float) -> float:

@@ -6,7 +6,6 @@ matches as bearing vectors in pixels, see `camera.bearings`; `E` is of rays, q' 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,8 +23,7 @@ from sfm_app.types import Calibration, RayFit, Rejected
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 
-@dataclass(frozen=True, slots=True)
-class RayOptions:
+class OPTIONS:
     """Samples, scores and the test for a rotation; none was measured on its own. Chosen by hand."""
 
     batch: int = 32
@@ -39,9 +37,6 @@ class RayOptions:
     """Shifts of the partners that measure chance."""
     rounds: int = 4
     """Fits that select inliers through lenses."""
-
-
-OPTIONS = RayOptions()
 
 
 def fit_lev_ransac_rays(lines: FloatArray, options: EpipolarSettings, seed: int) -> RayFit | Rejected:

@@ -33,8 +33,7 @@ NOT_NEEDED = "all at once: not needed"
 """Note of a global mapper that was stopped."""
 
 
-@dataclass(frozen=True, slots=True)
-class MappingOptions:
+class MAPPING:
     """When mapping starts, ends, and counts as good."""
 
     dissent_weight: float = 0.1
@@ -72,9 +71,6 @@ class MappingOptions:
     """Photos up to which mapping uses all pairs. Chosen by hand."""
     mapped_partners: int = 16
     """Partners of each photo above. Chosen by hand."""
-
-
-MAPPING = MappingOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,8 +16,7 @@ from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 # of its points. The similarity with which most shared photos agree is refined on their points.
 
 
-@dataclass(frozen=True, slots=True)
-class JoinOptions:
+class OPTIONS:
     """Similarities between fragments, and their errors. Chosen by hand."""
 
     min_photos: int = 3
@@ -50,9 +49,6 @@ class JoinOptions:
     """Largest angle of a photo to its pose in the merged model for its points to count."""
     same_shift: float = 0.25
     """Largest shift of it, as a share of the median distance of its points."""
-
-
-OPTIONS = JoinOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -70,8 +70,7 @@ FOLDER, STOP = "parts", "stop"
 """Folder of the parts, and the file in it that stops them all."""
 
 
-@dataclass(frozen=True, slots=True)
-class PartOptions:
+class OPTIONS:
     """When groups are mapped in parts. Chosen by hand."""
 
     max_whole: int = 400
@@ -84,9 +83,6 @@ class PartOptions:
     """Share of contradicting inliers of F above which the whole is mapped, too."""
     min_matches: int = 16
     """Matches across a join below which these decide nothing, as of a pair."""
-
-
-OPTIONS = PartOptions()
 
 
 @dataclass(frozen=True, slots=True)

@@ -202,8 +202,7 @@ def _grow_chunk(remaining: list[dict[int, PairId]], size: int) -> list[PairId]:
 # one or two differ in half of the runs).
 
 
-@dataclass(frozen=True, slots=True)
-class ChunkOptions:
+class CHUNKS:
     """Sizes of chunks of work."""
 
     most_photos: int = 8
@@ -220,8 +219,6 @@ class ChunkOptions:
     photos_in_memory: int = 32
     """Photos whose features stay in memory while pairs are matched; the others are read again. Chosen by hand."""
 
-
-CHUNKS = ChunkOptions()
 
 Item = TypeVar("Item")
 

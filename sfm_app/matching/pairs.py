@@ -24,8 +24,7 @@ ReadDescriptors = Callable[[int], retrieval.DescriptorArray]
 """Returns (N, 128) descriptors of a photo, the largest features first."""
 
 
-@dataclass(frozen=True, slots=True)
-class PairChoiceOptions:
+class OPTIONS:
     """How pairs are chosen."""
 
     largest_features: int = 1024
@@ -62,9 +61,6 @@ class PairChoiceOptions:
     """Share of its partners that a photo gets in the second round. Chosen by hand."""
     fewest_shared: int = 30
     """Fewest keypoints of third photos that match in both photos of a pair of the second round. Chosen by hand."""
-
-
-OPTIONS = PairChoiceOptions()
 
 
 def first_pairs(

@@ -23,8 +23,7 @@ from sfm_app.types.arrays import BoolArray, ByteArray, FloatArray
 # each show one point: zenith and nadir.
 
 
-@dataclass(frozen=True, slots=True)
-class PanoramaOptions:
+class OPTIONS:
     """Constants of panoramas. Recognition: chosen on 2:1 parts of real photos and on rendered panoramas."""
 
     whole: float = 0.995
@@ -50,9 +49,6 @@ class PanoramaOptions:
     """Rows and columns of a panorama whose rays the painted views cover. Chosen by hand."""
 
 
-OPTIONS = PanoramaOptions()
-
-
 def is_panorama(picture: DecodedPhoto, upright: Image.Image) -> bool:
     """Return whether a photo is a full panorama; raise an UnreadableError for another projection or a part of one."""
     entries = read_panorama_entries(picture.image)
@@ -66,7 +62,7 @@ def is_panorama(picture: DecodedPhoto, upright: Image.Image) -> bool:
         degrees = f"{360 * wide:.0f} x {180 * high:.0f} degrees"
         raise UnreadableError(f"a panorama of {degrees}: only full ones of 360 x 180 degrees can be used")
     if not _is_twice_as_wide(upright.size):
-        raise UnreadableError("a part of a panorama that claims the whole sphere")
+        raise UnreadableError("a part of a panorama: it is not twice as wide as high")
     return True
 
 

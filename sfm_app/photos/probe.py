@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -41,8 +41,7 @@ from sfm_app.types.photos import FILE, SEA_LEVEL, TAKE_OFF
 # background or an overexposed sky does not end like that.
 
 
-@dataclass(frozen=True, slots=True)
-class BarOptions:
+class BARS:
     """Constants of the detection of bars; sides are those of the picture across a bar."""
 
     tolerance: int = 8
@@ -67,9 +66,6 @@ class BarOptions:
     """Largest difference of the edges of pictures of one size."""
     same_share: float = 0.01
     """The same, as a share of the longer side; the larger one counts."""
-
-
-BARS = BarOptions()
 
 
 def shown_part(picture: Image.Image) -> Frame | None:

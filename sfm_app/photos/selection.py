@@ -25,8 +25,7 @@ READERS = ("sfm-app", "pillow", "opencv-contrib-python-headless")
 """Packages that decode and measure."""
 
 
-@dataclass(frozen=True, slots=True)
-class SelectionOptions:
+class OPTIONS:
     """Constants of the statistics of photos and of the choice by them."""
 
     analysis_px: int = 1024
@@ -56,9 +55,6 @@ class SelectionOptions:
     """Least share of flat squares of screenshots and drawings."""
     odd_size_share: float = 0.2
     """A size is odd if a smaller share of the photos has it."""
-
-
-OPTIONS = SelectionOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

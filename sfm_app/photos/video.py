@@ -264,8 +264,7 @@ def _pull(graph: "Graph", frame: "VideoFrame | None") -> Iterator["VideoFrame"]:
             return
 
 
-@dataclass(frozen=True, slots=True)
-class TrackingOptions:
+class OPTIONS:
     """Constants of the measurement of motion and sharpness."""
 
     step: float = 0.05
@@ -285,9 +284,6 @@ class TrackingOptions:
     """Window of the Lucas-Kanade method."""
     levels: int = 3
     """Its pyramid levels."""
-
-
-OPTIONS = TrackingOptions()
 
 
 @dataclass(frozen=True, slots=True)

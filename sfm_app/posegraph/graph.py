@@ -32,8 +32,7 @@ LOOKS_ALIKE = "equal things in different places"
 # from loops of other pairs, two matches determine the direction of translation.
 
 
-@dataclass(frozen=True, slots=True)
-class GuidedOptions:
+class GUIDED:
     """Poses with a known rotation; docs/algorithms/relative-poses.md."""
 
     samples: int = 200
@@ -46,9 +45,6 @@ class GuidedOptions:
     """Share of the inliers that must lie in front of both cameras. Measured on photo sets with truth."""
     max_rotation_deg: float = 2.0
     """Largest change of the rotation by refinement. Measured on photo sets with truth."""
-
-
-GUIDED = GuidedOptions()
 
 
 def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> RelativePose | None:
@@ -96,8 +92,7 @@ def sample_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> Flo
     return best if front >= behind else -best
 
 
-@dataclass(frozen=True, slots=True)
-class GraphOptions:
+class OPTIONS:
     """Which pairs stay; docs/algorithms/relative-poses.md."""
 
     min_in_front: float = 0.75
@@ -115,8 +110,6 @@ class GraphOptions:
     weak_factor: float = 2.0
     """A pair with fewer inliers than this multiple of the minimum needs a loop of other pairs. Chosen by hand."""
 
-
-OPTIONS = GraphOptions()
 
 NO_POSES: Mapping[PairId, RelativePose] = MappingProxyType({})
 

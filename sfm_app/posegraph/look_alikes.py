@@ -22,8 +22,7 @@ from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 # things in different places share only the things, however many matches these give, and nothing around them.
 
 
-@dataclass(frozen=True, slots=True)
-class LookAlikeOptions:
+class OPTIONS:
     """Detection of look-alikes; docs/algorithms/look-alikes.md has the measurements."""
 
     min_other_photos: int = 2
@@ -64,9 +63,6 @@ class LookAlikeOptions:
     """A cell with fewer expected points expects no match. Chosen by hand."""
     cells: int = 12
     """Cells along the longer side of a photo. Measured."""
-
-
-OPTIONS = LookAlikeOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

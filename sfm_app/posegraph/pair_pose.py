@@ -1,7 +1,6 @@
 """The relative pose of one pair of photos from F and two cameras, and the kind of the pair."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -31,8 +30,7 @@ from sfm_app.types.camera import PERSPECTIVE
 # the turn of a camera that looks at the same scene, so several turns are tried.
 
 
-@dataclass(frozen=True, slots=True)
-class PoseOptions:
+class OPTIONS:
     """Thresholds for the pose of a pair; docs/algorithms/relative-poses.md."""
 
     turns_deg: tuple[float, ...] = (-55.0, -30.0, -12.0, 12.0, 30.0, 55.0)
@@ -64,9 +62,6 @@ class PoseOptions:
     """Largest number of steps at each scale. Chosen by hand."""
     gain: float = 1e-6
     """Relative decrease of the cost below which they end. Chosen by hand."""
-
-
-OPTIONS = PoseOptions()
 
 
 def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:

@@ -63,8 +63,7 @@ def partners_of(pairs: Iterable[PairId]) -> dict[int, set[int]]:
 # weigh more than the least cut between the two ends (Ford and Fulkerson 1956).
 
 
-@dataclass(frozen=True, slots=True)
-class CorrectionOptions:
+class CORRECTIONS:
     """When a part of the photos is turned. Chosen by hand."""
 
     contradicts_deg: float = 10.0
@@ -75,9 +74,6 @@ class CorrectionOptions:
     """Flows are whole numbers of the largest weight over this."""
     max_turns: int = 20
     """Most parts of a graph that turn."""
-
-
-CORRECTIONS = CorrectionOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,8 +157,7 @@ def _make_network(
     return sparse.coo_array((values, (rows, columns)), shape=(count + 2, count + 2)).tocsr()
 
 
-@dataclass(frozen=True, slots=True)
-class AveragingOptions:
+class AVERAGING:
     """Rotation averaging; docs/algorithms/relative-poses.md."""
 
     agreement_deg: float = 5.0
@@ -181,9 +176,6 @@ class AveragingOptions:
     """Loops that are checked at once, to bound the memory. Chosen by hand."""
     dense_photos: int = 400
     """Most photos for which a dense system costs less than conjugate gradients. Counted."""
-
-
-AVERAGING = AveragingOptions()
 
 
 def average_rotations(

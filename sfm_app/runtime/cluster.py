@@ -37,8 +37,7 @@ logger = logging.getLogger("sfm_app")
 Result = TypeVar("Result")
 
 
-@dataclass(frozen=True, slots=True)
-class TransferOptions:
+class OPTIONS:
     """Sizes and times of the work on a cluster."""
 
     look_s: float = 2.0
@@ -54,8 +53,6 @@ class TransferOptions:
     most_items: int = 32
     """Most items of a call: the cost of a lost worker. Chosen by hand."""
 
-
-OPTIONS = TransferOptions()
 
 # Serialization. Pickles are read here only, since they may run any code. Their bytes, or the hashes of their files,
 # come through the network of the cluster, which has to be trusted as a whole. A file with another hash is refused.

@@ -23,8 +23,7 @@ SERIAL_STAGES = ("scene", "mesh")
 """Stages that more workers hardly speed up."""
 
 
-@dataclass(frozen=True, slots=True)
-class CostOptions:
+class OPTIONS:
     """Measured rates, each per megapixel (MP) of photos or depth maps."""
 
     features_per_mp: int = 4500
@@ -43,9 +42,6 @@ class CostOptions:
     """Memory of the refinement without photos. Measured."""
     refine_mb_per_mp: float = 25.0
     """Memory of the refinement per megapixel held at once, with divided triangles. Measured."""
-
-
-OPTIONS = CostOptions()
 
 
 @dataclass(frozen=True, slots=True)

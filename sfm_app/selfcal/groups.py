@@ -37,8 +37,7 @@ LEAST_PAIRS_OF_SEVERAL = 2
 definition of the constraint (thesis 5.2.4)."""
 
 
-@dataclass(frozen=True, slots=True)
-class GroupOptions:
+class GROUPS:
     """Focals on a grid, and the verdict on a camera of several. Section 6 of docs/algorithms/zero-curves.md."""
 
     focals: int = 41
@@ -52,9 +51,6 @@ class GroupOptions:
     `benchmarks.trouble`, seeds 0 to 179 and 1000 to 1020."""
     least_support: float = 0.8
     """Share that all of its photos together must give; two cameras get 0.86 to 0.93. Chosen with it."""
-
-
-GROUPS = GroupOptions()
 
 
 def log_focal_grid(count: int) -> FloatArray:

@@ -27,8 +27,7 @@ COLUMNS = {CENTER: [CENTER_U, CENTER_U + 1], ASPECT: [LOG_ASPECT], LENS: [KAPPA]
 PART_OF_COLUMN = [FOCAL, CENTER, CENTER, ASPECT, LENS]
 
 
-@dataclass(frozen=True, slots=True)
-class PriorOptions:
+class PRIORS:
     """Usual cameras, and how far photos depart from them."""
 
     usual_log_focal: float = float(np.log(1.2))
@@ -46,9 +45,6 @@ class PriorOptions:
     least_redundancy: float = 0.25
     """Least share of redundant constraints for freeing more: three pairs fit almost any center.
     docs/algorithms/zero-curves.md, 3; by hand."""
-
-
-PRIORS = PriorOptions()
 
 
 def claim_rows(priors: Sequence[CameraPrior | None], sizes: Sequence[tuple[int, int]], unit_px: float) -> FloatArray:

@@ -33,8 +33,7 @@ RAY_STEP = 1e-5
 """The same in points, in longer sides: errors of about 1e-10 of the derivatives in double precision."""
 
 
-@dataclass(frozen=True, slots=True)
-class LensSearchOptions:
+class SEARCH:
     """The grid of lenses, the pairs that vote, and the verdict."""
 
     exponents: tuple[float, ...] = (0.5, 0.0, -0.5)
@@ -103,7 +102,6 @@ class LensRefinementOptions:
     hand."""
 
 
-SEARCH = LensSearchOptions()
 REFINEMENT = LensRefinementOptions()
 
 

@@ -22,21 +22,27 @@ from sfm_app.synthetic.shapes import (
 )
 from sfm_app.types.arrays import FloatArray
 
-SANDSTONE = Material("stone", base=(206, 186, 150), second=(158, 132, 98), scale=0.35)
-LIMESTONE = Material("stone", base=(214, 208, 194), second=(166, 158, 142), scale=0.3, contrast=0.45)
-PLASTER = Material("stone", base=(204, 164, 116), second=(178, 128, 88), scale=0.35)
-TERRACOTTA = Material("stone", base=(192, 104, 66), second=(150, 72, 48), scale=0.2)
-GLAZE = Material("stone", base=(60, 46, 40), second=(150, 84, 46), scale=0.15)
-BRICK = Material("brick", base=(150, 76, 56), second=(188, 116, 84), joint=(190, 182, 168), scale=0.16, contrast=0.6)
-PAVING = Material("paving", base=(150, 146, 138), second=(116, 112, 108), scale=0.55, contrast=0.6)
-POTTERY = Material(
-    "ceramic", base=(206, 122, 62), second=(44, 34, 32), joint=(226, 198, 150), scale=0.085, contrast=0.45
+SANDSTONE = Material(pattern="stone", base=(206, 186, 150), second=(158, 132, 98), scale=0.35)
+LIMESTONE = Material(pattern="stone", base=(214, 208, 194), second=(166, 158, 142), scale=0.3, contrast=0.45)
+PLASTER = Material(pattern="stone", base=(204, 164, 116), second=(178, 128, 88), scale=0.35)
+TERRACOTTA = Material(pattern="stone", base=(192, 104, 66), second=(150, 72, 48), scale=0.2)
+GLAZE = Material(pattern="stone", base=(60, 46, 40), second=(150, 84, 46), scale=0.15)
+BRICK = Material(
+    pattern="brick", base=(150, 76, 56), second=(188, 116, 84), joint=(190, 182, 168), scale=0.16, contrast=0.6
 )
-WOOD = Material("wood", base=(178, 132, 82), second=(120, 78, 42), joint=(48, 32, 20), scale=0.24)
-MARBLE = Material("marble", base=(224, 220, 214), second=(88, 92, 104), joint=(180, 160, 130), scale=0.3, contrast=0.35)
+PAVING = Material(pattern="paving", base=(150, 146, 138), second=(116, 112, 108), scale=0.55, contrast=0.6)
+POTTERY = Material(
+    pattern="ceramic", base=(206, 122, 62), second=(44, 34, 32), joint=(226, 198, 150), scale=0.085, contrast=0.45
+)
+WOOD = Material(pattern="wood", base=(178, 132, 82), second=(120, 78, 42), joint=(48, 32, 20), scale=0.24)
+MARBLE = Material(
+    pattern="marble", base=(224, 220, 214), second=(88, 92, 104), joint=(180, 160, 130), scale=0.3, contrast=0.35
+)
 GREEN_MARBLE = replace(MARBLE, base=(70, 110, 88), second=(206, 214, 196), joint=(30, 52, 44))
-LEAVES = Material("leaves", base=(46, 92, 34), second=(124, 156, 62), joint=(18, 34, 14), scale=0.055)
-PAINT = Material("stripes", base=(38, 84, 140), second=(222, 206, 170), joint=(120, 92, 70), scale=0.2, contrast=0.4)
+LEAVES = Material(pattern="leaves", base=(46, 92, 34), second=(124, 156, 62), joint=(18, 34, 14), scale=0.055)
+PAINT = Material(
+    pattern="stripes", base=(38, 84, 140), second=(222, 206, 170), joint=(120, 92, 70), scale=0.2, contrast=0.4
+)
 
 BACK_WALL_Z = -2.6
 PEDESTAL_TOP_Y = 1.36
@@ -155,9 +161,11 @@ def _catmull_rom(knots: FloatArray, steps: int) -> FloatArray:
     return np.column_stack([np.maximum(points[:, 0], 0.0), points[:, 1]])
 
 
-STONE = Material("stone", base=(222, 214, 198), second=(168, 158, 140), joint=(92, 86, 76), scale=0.22)
-BOX_LEAVES = Material("leaves", base=(50, 88, 38), second=(112, 142, 66), joint=(20, 34, 16), scale=0.045)
-BRONZE = Material("leaves", base=(74, 96, 66), second=(132, 118, 66), joint=(40, 44, 30), scale=0.035, contrast=0.4)
+STONE = Material(pattern="stone", base=(222, 214, 198), second=(168, 158, 140), joint=(92, 86, 76), scale=0.22)
+BOX_LEAVES = Material(pattern="leaves", base=(50, 88, 38), second=(112, 142, 66), joint=(20, 34, 16), scale=0.045)
+BRONZE = Material(
+    pattern="leaves", base=(74, 96, 66), second=(132, 118, 66), joint=(40, 44, 30), scale=0.035, contrast=0.4
+)
 PLINTH_TOP_Y = 1.02
 BLOBS = np.array([
     # middle x, y, z; half axes x, y, z; weight
@@ -208,7 +216,10 @@ def bust() -> Shape:
 
 
 def bust_field(points: FloatArray) -> FloatArray:
-    """Return the implicit function of the bust at (N, 3) points, positive inside."""
+    """Return the implicit function of the bust at (N, 3) points, positive inside.
+
+    Blended blobs (Blinn, ACM TOG 1982), with curls in the hair and folds in the cloth.
+    """
     middles, axes, weights = BLOBS[:, :3], BLOBS[:, 3:6], BLOBS[:, 6]
     # squared distances to all blob centers, in half axes, as matrix products
     squares = points**2 @ axes.T**-2.0 - 2.0 * points @ (middles / axes**2).T + ((middles / axes) ** 2).sum(axis=1)
