@@ -97,9 +97,7 @@ class CalibrationSettings(Section):
     file: str = Field("", description="file or folder of known cameras, as of COLMAP or OpenCV; none where empty")
     keep: bool = Field(False, description="keep the cameras of the calibration file as they are")
     priors: str = Field("auto", description="guesses cameras from photos; auto: an installed one; none: only EXIF")
-    deviation: float = Field(
-        0.0, ge=0, le=1, description="deviation of the file's focals, as a share; 0: they are used"
-    )
+    deviation: float = Field(0.0, ge=0, le=1, description="deviation of the file's focals (a share); 0: exact")
     center_sigma: float = Field(0.15, gt=0, le=10, description="deviation of the center from the middle, in widths")
 
 

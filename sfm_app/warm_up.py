@@ -23,11 +23,7 @@ WIDTH, HEIGHT, FOCAL = 480, 360, 520.0
 """Size and focal length of the photos in pixels: small, and mapped with certainty. Chosen by hand."""
 SIDE = 640
 """Side of the pictures on the walls, in pixels."""
-SETTINGS = {
-    "report": False,
-    "matching": {"enlarge_below": 0, "max_features": 2000},
-    "depth": {"max_image_size_px": 240},
-}
+QUICK = {"report": False, "matching": {"enlarge_below": 0, "max_features": 2000}, "depth": {"max_image_size_px": 240}}
 """Settings that save time and need the same kernels."""
 
 
@@ -73,7 +69,7 @@ def main() -> None:
     os.environ[PARENT] = str(os.getpid())
     try:
         write_photos(folder / "photos")
-        reconstruct(folder / "photos", folder / "model", Settings.from_mapping(SETTINGS))
+        reconstruct(folder / "photos", folder / "model", Settings.from_mapping(QUICK))
     finally:
         WARM.parent.mkdir(parents=True, exist_ok=True)
         WARM.touch()

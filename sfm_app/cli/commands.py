@@ -55,7 +55,7 @@ ENOUGH_DISK = 2 * GIGABYTE
     metavar="STAGE",
     help=f"Run this stage and all later ones again: {', '.join(STAGES)}.",
 )
-@click.option("--until", "last", type=click.Choice(STAGES), metavar="STAGE", default="files", help="Stop after it.")
+@click.option("--until", "last", type=click.Choice(STAGES), metavar="STAGE", default="files", help="Last stage.")
 @settings_options
 @output_options
 def run(photos: tuple[Path, ...], out: Path | None, first: str | None, last: str, **flags: Any) -> None:
@@ -116,9 +116,9 @@ def calibrate(photos: tuple[Path, ...], out: Path | None, figure: Path | None, *
     metavar="NAME",
     default="apriltag-36h11",
     show_default=True,
-    help=", ".join(MARKER_FAMILIES),
+    help=f"Marker family: {', '.join(MARKER_FAMILIES)}.",
 )
-@click.option("--first", type=click.IntRange(0, 10_000), default=0, show_default=True, help="First number.")
+@click.option("--first", type=click.IntRange(0, 10_000), default=0, show_default=True, help="Number of the first.")
 @click.option("--paper", type=click.Choice(PAPERS), default="a4", show_default=True, help="Size of the page.")
 def markers(side: str, target: Path, family: str, first: int, paper: str) -> None:
     """Make a page of markers to print and to place in the scene; SIDE is their side length, such as 50mm.

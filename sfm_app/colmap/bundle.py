@@ -220,9 +220,7 @@ def _choose_most_factored(model: Reconstruction) -> int:
     if len(photos) <= OPTIONS.most_tied:
         return OPTIONS.most_tied
     rows = {photo: row for row, photo in enumerate(photos)}
-    tracked = [
-        (rows[one.image_id], k) for k, (_, point) in enumerate(all_points(model)) for one in point.track.elements
-    ]
+    tracked = [(rows[one.image_id], k) for k, (_, p) in enumerate(all_points(model)) for one in p.track.elements]
     photo, point = np.array(tracked, np.int64).reshape(-1, 2).T
     return len(photos) if elimination_width(photo, point) <= OPTIONS.most_tied else OPTIONS.most_tied
 

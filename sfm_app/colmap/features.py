@@ -75,9 +75,7 @@ def find_sift(database: Path, settings: SiftSettings, names: Sequence[str], work
     def call(token: Token) -> None:
         for first in range(0, len(new), batch):
             some = {name: sizes[name] for name in new[first : first + batch]}
-            features = _find_in_photos(
-                {name: some[name] for name in some.keys() - panoramas}, settings, extraction, token
-            )
+            features = _find_in_photos({k: some[k] for k in some.keys() - panoramas}, settings, extraction, token)
             for name in some.keys() & panoramas:
                 features[name] = _find_in_panorama(name, settings, extraction, token)
             if token.is_cancelled:

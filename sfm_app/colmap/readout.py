@@ -22,10 +22,7 @@ Keypoints = Mapping[int, FloatArray]
 
 def read_keypoints(model: Reconstruction) -> dict[int, FloatArray]:
     """Return the keypoints (N, 2) of all posed photos by id, in pixels."""
-    return {
-        image.image_id: np.array([keypoint.xy for keypoint in image.points2D], np.float64).reshape(-1, 2)
-        for image in posed_images(model)
-    }
+    return {i.image_id: np.array([p.xy for p in i.points2D], np.float64).reshape(-1, 2) for i in posed_images(model)}
 
 
 def measure_readout(

@@ -83,10 +83,7 @@ def write_model(model_dir: Path, lenses: Mapping[int, WideLens], dense_dir: Path
     with translate_errors("writing the model of perspective views"):
         model = Reconstruction(model_dir)
         photos = {image.name: image.camera_id for image in sorted(posed_images(model), key=lambda image: image.name)}
-        names = {
-            name: [view_name(name, number) for number in range(len(lenses[camera_id].views))]
-            for name, camera_id in photos.items()
-        }
+        names = {n: [view_name(n, k) for k in range(len(lenses[c].views))] for n, c in photos.items()}
 
         def points_in_camera(image: pycolmap.Image, tracked: Sequence[pycolmap.Point2D]) -> FloatArray:
             pose = image.cam_from_world().matrix()

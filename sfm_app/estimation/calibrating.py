@@ -197,11 +197,7 @@ def photo_pairs(
     The matrices of the kind `RayFit` are of bearing vectors.
     """
     ids = {image.id for image in images}
-    fits = {
-        pair: fit
-        for pair, fit in views.fits.items()
-        if ids.issuperset(pair) and isinstance(fit, kind) and not fit.degeneracy
-    }
+    fits = {p: f for p, f in views.fits.items() if ids.issuperset(p) and isinstance(f, kind) and not f.degeneracy}
     return PhotoPairs(
         Fs=np.array([fit.matrix for fit in fits.values()], np.float64).reshape(-1, 3, 3),
         weights=pair_weights(np.array([fit.inlier_count for fit in fits.values()], np.int64)),

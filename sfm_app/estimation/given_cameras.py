@@ -165,9 +165,7 @@ def report_checks(checked: Mapping[str, tuple[Calibration, Calibration | None]],
     """Announce contradictions, and record all checks: by name the given camera and that of the photos, if any."""
     if not checked:
         return
-    contradictions = {
-        name: find_contradictions(given, estimate) if estimate else [] for name, (given, estimate) in checked.items()
-    }
+    contradictions = {k: find_contradictions(a, b) if b else [] for k, (a, b) in checked.items()}
     for name, contradicted in contradictions.items():
         for one in contradicted:
             run.progress.say(f"beware: the photos contradict the given camera {name}: {one.text}")

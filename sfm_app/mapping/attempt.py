@@ -127,9 +127,7 @@ def coverage(matches: MatchGraph, pair: PairId, pose: RelativePose) -> float:
     shares = []
     for photo, x in zip(pair, matches.points(pair), strict=True):
         image = matches.images[photo]
-        cells = (
-            (x[pose.inliers] / [image.width, image.height] * MAPPING.grid).astype(np.int64).clip(0, MAPPING.grid - 1)
-        )
+        cells = (x[pose.inliers] / [image.width, image.height] * MAPPING.grid).astype(int).clip(0, MAPPING.grid - 1)
         filled = len(np.unique(cells[:, 0] * MAPPING.grid + cells[:, 1]))
         shares.append(filled / min(MAPPING.grid * MAPPING.grid, max(pose.inlier_count, 1)))
     return float(np.sqrt(shares[0] * shares[1]))

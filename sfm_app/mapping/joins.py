@@ -294,14 +294,10 @@ def _synchronize(joins: Sequence[Join], count: int) -> dict[int, Similarity]:
     scales = np.exp(_robust_potentials(count, edges, logs, strengths, np.ones(len(joins)))[:, 0])
     turns = [Similarity(float(scale), rotations.get(k, np.eye(3)), np.zeros(3)) for k, scale in enumerate(scales)]
     # where the shared photos are, errors of rotations shift least
-    steps = np.concatenate(
-        [turns[join.first](join.similarity(join.middle)) - turns[join.second](join.middle) for join in joins]
-    )
+    steps = np.concatenate([turns[j.first](j.similarity(j.middle)) - turns[j.second](j.middle) for j in joins])
     sizes = np.full(len(joins), max(float(np.linalg.norm(steps, axis=1).mean()), 1e-300))
     shifts = _robust_potentials(count, edges, steps, strengths, sizes)
-    return frames | {
-        number: Similarity(float(scales[number]), rotations[number], shifts[number]) for number in sorted(rotations)
-    }
+    return frames | {k: Similarity(float(scales[k]), rotations[k], shifts[k]) for k in sorted(rotations)}
 
 
 def _robust_potentials(
@@ -330,9 +326,7 @@ def merge_fragments(fragments: Sequence[Fragment], frames: Mapping[int, Similari
         R = np.einsum("nij,kj->nik", placed.R, frame.R)
         models[number] = replace(placed, R=R, centers=frame(placed.centers), X=frame(placed.X))
     photos, R, centers, source = _choose_poses(fragments, models)
-    cameras = {
-        photo: models[number].cameras[photo] for photo, number in zip(photos.tolist(), source.tolist(), strict=True)
-    }
+    cameras = {k: models[n].cameras[k] for k, n in zip(photos.tolist(), source.tolist(), strict=True)}
     tracks = [_sound_observations(model, photos, R, centers) for model in models.values()]
     X, point, photo, keypoint = _merge_tracks(tracks)
     return PlacedPhotos(photos, R, centers, X, point, photo, keypoint, cameras)

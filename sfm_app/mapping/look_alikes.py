@@ -233,9 +233,7 @@ def _neighbors(posed: Mapping[int, PosedPhotoPoints]) -> Iterator[PairId]:
         nearby = nearby[
             (directions[nearby] @ directions[number] > np.cos(np.radians(OVERLAPS.max_angle_deg))) & (nearby != number)
         ]
-        chosen = nearby[
-            np.unique(np.linspace(0, len(nearby) - 1, min(OVERLAPS.candidates, len(nearby))).astype(np.int64))
-        ]
+        chosen = nearby[np.unique(np.linspace(0, len(nearby) - 1, min(OVERLAPS.candidates, len(nearby))).astype(int))]
         yield from ((photos[number], photos[other]) for other in chosen)
 
 

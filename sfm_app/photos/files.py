@@ -101,11 +101,7 @@ NAMED_BYTES = 1_000_000
 
 
 def list_photos(folder: Path, out: Path, listed_in: Path | None = None, closed: Sequence[Path] = ()) -> dict[str, str]:
-    """Return the names that `list_files` does, each with the reason why it is no photo; most reasons are empty.
-
-    `listed_in` is a text file with the names to return instead, one per line. An InputError says that the folder does
-    not exist or cannot be read.
-    """
+    """Return the names of `list_files`, or those that a file lists, each with the reason why it is no photo or ""."""
     if not folder.is_dir():
         raise _bad_path_error(folder)
     if listed_in is not None:

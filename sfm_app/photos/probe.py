@@ -95,10 +95,7 @@ def unify_frames(photos: Sequence[Photo]) -> list[Photo]:
     if len(barred) == 1 and 2 * sum(not photo.shown for photo in photos) <= len(photos):
         numbers = [*barred] * len(photos)
     medians = [np.median([_edges(frame) for frame in frames], axis=0) for frames in clusters]
-    return [
-        replace(photo, shown=_frame_within(photo, medians[number]))
-        for photo, number in zip(photos, numbers, strict=True)
-    ]
+    return [replace(one, shown=_frame_within(one, medians[k])) for one, k in zip(photos, numbers, strict=True)]
 
 
 def _cluster_frames(photos: Sequence[Photo]) -> tuple[list[list[Frame]], list[int]]:
@@ -250,10 +247,7 @@ def _complete_panoramas(photos: Sequence[Photo]) -> list[Photo]:
     counts = Counter((photo.width, photo.height) for photo in photos)
     panoramas = Counter((photo.width, photo.height) for photo in photos if photo.projection == EQUIRECTANGULAR)
     sizes = {size for size, count in panoramas.items() if count > counts[size] / 2 and size[0] == 2 * size[1]}
-    return [
-        replace(photo, projection=EQUIRECTANGULAR) if (photo.width, photo.height) in sizes else photo
-        for photo in photos
-    ]
+    return [replace(one, projection=EQUIRECTANGULAR) if (one.width, one.height) in sizes else one for one in photos]
 
 
 def with_one_zero(photos: Sequence[Photo]) -> list[Photo]:

@@ -98,10 +98,7 @@ class Video:
         return self.seconds + reordered_s < 0.95 * self.claimed_s
 
     def small_frames(self) -> Iterator[tuple[int, Picture]]:
-        """Yield gray pictures of about 30 frames per second with their numbers, as stored: not turned.
-
-        Their longer side has at most 480 pixels, and all have the size of the first.
-        """
+        """Yield gray pictures of about 30 frames per second, at most 480 px long, not turned, with their numbers."""
         last = -1
         size: tuple[int, int] | None = None
         for number, frame in self._read_frames():

@@ -140,23 +140,17 @@ def build_pose_graph(
     cameras = {photo: evidence.camera(photo) for photo in matches.images}
     look_alikes = find_look_alikes(matches, poses if options.look_alikes else {}, cameras)
     _drop_pairs([pair for join in look_alikes.joins for pair in join.pairs], LOOKS_ALIKE, poses, dropped)
-    estimator.rotations, angles = average_pair_rotations(
-        poses, {pair for pair, fit in views.fits.items() if fit.degeneracy}
-    )
+    estimator.rotations, angles = average_pair_rotations(poses, {p for p, fit in views.fits.items() if fit.degeneracy})
     _drop_pairs(_contradicting_pairs(poses, angles), CONTRADICTS, poses, dropped)
 
     rest = [pair for pair in _pairs_without_pose(matches.matches, poses, known) if dropped.get(pair) != LOOKS_ALIKE]
-    for pair, pose in zip(
-        rest, run_map(estimator.from_rotations, rest, "relative poses by known rotations"), strict=True
-    ):
+    for pair, pose in zip(rest, run_map(estimator.from_rotations, rest, "poses by known rotations"), strict=True):
         if pose is not None and not look_alikes.is_look_alike(pair, matches.matches[pair][pose.inliers]):
             poses[pair] = pose
             dropped.pop(pair, None)
     poses = dict(sorted(poses.items()))
     _drop_pairs(_unconfirmed_pairs(poses, OPTIONS.weak_factor * options.min_inliers), UNCONFIRMED, poses, dropped)
-    doubtful = (
-        replace(join, pairs=tuple(pair for pair in join.pairs if pair in poses)) for join in look_alikes.doubtful
-    )
+    doubtful = (replace(join, pairs=tuple(p for p in join.pairs if p in poses)) for join in look_alikes.doubtful)
     return PoseGraph(poses, dropped, _groups(poses), look_alikes.joins, tuple(join for join in doubtful if join.pairs))
 
 

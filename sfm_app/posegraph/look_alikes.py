@@ -86,9 +86,7 @@ def compute_visibility(matches: MatchGraph, poses: Mapping[PairId, RelativePose]
         for photo, column in zip(pair, inliers.T, strict=True):
             partners[photo][np.unique(column)] += 1
     images = matches.images
-    cells = {
-        photo: cell_numbers(matches.keypoints[photo], images[photo].width, images[photo].height) for photo in photos
-    }
+    cells = {k: cell_numbers(matches.keypoints[k], images[k].width, images[k].height) for k in photos}
     return Visibility(rows, partners, cells)
 
 
@@ -126,9 +124,7 @@ def backbone(covered: Mapping[PairId, float]) -> set[PairId]:
         joining = groups.join(a, b)
         inside = set(joining)
         for photo in joining:
-            across = (
-                other for other in partners[photo] if other not in inside and groups.name[other] == groups.name[a]
-            )
+            across = (b for b in partners[photo] if b not in inside and groups.name[b] == groups.name[a])
             joined = ((min(photo, other), max(photo, other)) for other in across)
             chosen |= {pair for pair in joined if covered[pair] >= OPTIONS.backbone_share * covered[a, b]}
     return chosen
@@ -352,9 +348,7 @@ def _build_tracks(visibility: Visibility, pairs: Iterable[PairId]) -> FeatureTra
     joined = np.zeros(count, np.bool_)
     joined[first] = joined[second] = True
     names[~joined] = -1
-    return FeatureTracks(
-        {photo: names[start : start + len(visibility.partners[photo])] for photo, start in starts.items()}
-    )
+    return FeatureTracks({k: names[start : start + len(visibility.partners[k])] for k, start in starts.items()})
 
 
 def group_doubted_pairs(doubted: Iterable[PairId], trusted: Iterable[PairId]) -> list[tuple[PairId, ...]]:
@@ -395,15 +389,9 @@ def _judge_join(
     join: tuple[PairId, ...], partners: Mapping[int, set[int]], rotations: Mapping[int, FloatArray], places: Depths
 ) -> tuple[LookAlikes, str]:
     claimed = partners_of(join)
-    counts = [
-        count_missing_cells(photo, claimed[photo], partners[photo], places)
-        for photo in sorted(claimed)
-        if photo in partners
-    ]
+    counts = [count_missing_cells(k, claimed[k], partners[k], places) for k in sorted(claimed) if k in partners]
     expected, missing = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
-    shares = [
-        missing_here / expected_here for expected_here, missing_here in counts if expected_here >= OPTIONS.min_cells
-    ]
+    shares = [lost / due for due, lost in counts if due >= OPTIONS.min_cells]
     same_turn = _rotation_gap_deg(join, rotations, places) <= OPTIONS.same_rotation_deg
     limit = OPTIONS.max_missing_same_rotation if same_turn else OPTIONS.max_missing
     alike = len(shares) >= OPTIONS.min_photos and float(np.percentile(shares, OPTIONS.low_percentile)) > limit

@@ -117,9 +117,7 @@ def render_page(contents: RunContents, parts: LargeParts, other: RunContents | N
     model = _read_model(contents)
     rows = photo_rows(contents, model, parts.pictures)
     warnings, others = findings.remarks(contents)
-    photos = [
-        {key: value for key, value in asdict(row).items() if key != "picture" and value is not None} for row in rows
-    ]
+    photos = [{k: v for k, v in asdict(row).items() if k != "picture" and v is not None} for row in rows]
     page = _environment().get_template("page.html.jinja").render(
         title=contents.run.workspace.root.resolve().name,
         headline=headline(contents, rows),

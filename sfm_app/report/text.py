@@ -141,9 +141,7 @@ def contradiction_lines(counts: Mapping[str, Any]) -> list[str]:
 def k_text(K: Any, spread: Mapping[str, float] = MappingProxyType({})) -> str:
     """Return focals and center of K (3, 3) in pixels, with those standard deviations that are known."""
     values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    parts = (
-        f"{name} {value:.1f}" + (f" +- {spread[name]:.1f}" if name in spread else "") for name, value in values.items()
-    )
+    parts = (f"{k} {v:.1f}" + (f" +- {spread[k]:.1f}" if k in spread else "") for k, v in values.items())
     return "  ".join(parts) + " px"
 
 
@@ -308,14 +306,10 @@ def _doubt_lines(counts: Mapping[str, Any]) -> Iterator[str]:
         )
     for join in counts.get("perhaps_look_alikes", ()):
         here, there = (list_names(names, NAMES_SHOWN) for names in join["between"])
-        yield (
-            f"beware: a loop, or look-alikes: {join['pairs']} pairs match {here} with {there}, no photos between them"
-        )
+        yield f"beware: a loop, or look-alikes: {join['pairs']} pairs match {here} with {there}, without photos between"
     for names in counts.get("weakly_joined", ()):
-        yield (
-            f"beware: few points determine the distance of {list_names(names, NAMES_SHOWN)} from "
-            "the rest; take more between"
-        )
+        text = list_names(names, NAMES_SHOWN)
+        yield f"beware: few points determine the distance of {text} from the rest; take more photos between them"
     for before, after in counts.get("jumps", ()):
         yield f"beware: a jump between the consecutive photos {before} and {after}; in a video, a sign of look-alikes"
 

@@ -316,9 +316,7 @@ def lay_out_photo(photo: Photo, *, folder: Path, target: Path) -> None:
     try:
         lay_out(photo, folder, target)
     except UnreadableError as err:
-        raise InputError(
-            f"{photo.label} has changed while it was read: {err}", hint="restore it and run again"
-        ) from err
+        raise InputError(f"{photo.label} has changed while it was read: {err}", hint="restore it") from err
 
 
 def _copy_digest(photo: Photo, run: RunContext) -> str | None:
