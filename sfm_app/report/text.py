@@ -290,7 +290,7 @@ def _shutter_lines(shutter: Mapping[str, Any]) -> Iterator[str]:
 
 def _adjustment_warnings(adjustment: Mapping[str, Any]) -> Iterator[str]:
     if adjustment.get("failed"):
-        yield (f"beware: the last adjustment failed ({adjustment['failed']}); cameras and poses have unknown errors")
+        yield f"beware: the last adjustment failed ({adjustment['failed']}); cameras and poses are those of mapping"
     for number, reason in adjustment.get("failed_in_other_models", {}).items():
         yield f"beware: the last adjustment of other_models/{number} failed ({reason})"
     for name in adjustment.get("cameras_held", ()):
