@@ -51,7 +51,7 @@ def run_summary(run: Run) -> dict[str, Any]:
         "report": str(run.report_path) if run.report_path else None,
         "seconds": {name: stage["seconds"] for name, stage in stages.items()},
     }
-    optional = {"video": photos.get("video"), "given_cameras": given_cameras}
+    optional = {"video": photos.get("video"), "missing": photos.get("missing"), "given_cameras": given_cameras}
     summary |= {name: value for name, value in optional.items() if value}
     if run.scene:
         points = [str(path) for path in _model_files(run, "scale")]

@@ -67,6 +67,8 @@ def test_masks_and_positions_of_no_use_are_warnings_in_the_terminal_and_in_the_r
     assert "masks       2 of 3 photos\nbeware      masks hide nothing: a.jpg\n" in told
     for text in ("masks belong to no photo: other.jpg.png", "geo.txt names photos that are not there: lost.jpg"):
         assert text in told and text in page
+    found = json.loads(read(folder, tmp_path / "out", "--json").stdout)
+    assert found["missing"] == {"geo.txt": ["lost.jpg"]} and found["masks"]["white"] == ["a.jpg"]
     (folder / "geo.txt").write_text("EPSG:4326\na.jpg 8.5 47.3 400\n")
     assert "lost.jpg" not in read(folder, tmp_path / "out", "-q").stdout
 
