@@ -1,0 +1,272 @@
+"""Outlines of finished models as an eye sees them: borders, holes, fringes at depth edges, speckles, silhouettes.
+
+python -m benchmarks.surface.outlines OUT OUT
+python -m benchmarks.surface.outlines CACHE/surface/* --truth CACHE/rendered
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from benchmarks.common.command_line import add_results, new_parser
+from benchmarks.common.results import Row, document, table, write
+from benchmarks.surface.photos import LEAST_PIXELS, PlacedPhoto, placed_photo, placed_photos, render_view
+from benchmarks.surface.rendered.truth import sights_of
+from sfm_app.products import read_frame, read_texture
+from sfm_app.runtime.workspace import Workspace
+from sfm_app.synthetic.cameras import Camera, pixel_rays
+from sfm_app.synthetic.compare import align_centers
+from sfm_app.synthetic.photo_folder import TRUTH_FILE, Truth, load_truth
+from sfm_app.synthetic.render import PreparedModel, cast_rays, ray_caster
+from sfm_app.types import Surface
+from sfm_app.types.scene import camera_center
+from sfm_app.types.surface import Model
+
+Mask = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+WIDEST = 1600
+"""Width in pixels that wider photos are reduced to, so that limits in pixels mean the same for all cameras."""
+SEEN_BY, RIM = 3, 0.03
+"""Least number of photos that see a place whose surface is required, and the share of the width at the rim of a photo
+where it may end: a surface ends where photos end."""
+HIDDEN = 5e-3
+"""Share of its distance by which a border may lie behind the first surface on its ray, and still be seen."""
+HOLE_PX = 2.0
+"""Least side of the square of a hole's area in some photo: a smaller one is not seen."""
+JUMP = 0.01
+"""Change of depth from pixel to pixel at a depth edge: a plane has it where it is seen at 4 degrees."""
+BAND_PX = 3
+"""Distance from a depth edge up to which pixels belong to it."""
+GAP_PX = 8
+"""Half the width of a gap that the model surrounds: it closes with it. Wider ones may show the sky."""
+OFF = 10.0
+"""Difference of gray from all nine pixels of the photo around that makes a color wrong: the neighbors excuse an edge
+that lies a pixel aside, and the blur of a pixel."""
+SPECKLE_PX = 30
+"""Number of pixels from which a wrong patch is a wrong part, not a speckle."""
+NEAR_PX = 1.0
+"""Distance from a true silhouette at which one is right."""
+STEP = 4
+"""Distance in pixels of the places that decide what other photos see."""
+ABOUT = (
+    "Finished models, rendered into the cameras of their photos at 1600 pixels of width or less. borders: length of "
+    "the model's borders that three photos see (in the photo, not hidden, not at its rim), as far as each photo sees "
+    "them, in photo widths, mean over the photos; holes: closed ones of at least 2 pixels around nothing; largest "
+    "hole: square root of its area in the photo that sees it largest. At depth edges: of the pixels within 3 px of a "
+    "depth edge or outline of the model, which the model covers or surrounds; open: without surface, in gaps of at "
+    "most 16 px; off: more than 10 gray levels from all nine pixels of the photo around, after a gain and an offset. "
+    "speckles: patches of open or off pixels, smaller than 30, per million pixels of the model. Silhouettes: the "
+    "depth edges of the model and of the truth in the true camera, once the mesh is moved onto the truth by the "
+    "camera centers, near surfaces that three photos see; right: within 1 px of each other."
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Borders:
+    """Edges that one triangle alone has."""
+
+    ends: FloatArray
+    """(E, 2, 3) in the order of the triangle, which lies on their left seen from outside."""
+    loop: IndexArray
+    """(E,) number of the loop that an edge belongs to."""
+
+
+def find_borders(surface: Surface) -> Borders:
+    """Find the borders of a surface; vertices at the same place are one."""
+    places, own = np.unique(surface.vertices.astype(np.float32), axis=0, return_inverse=True)
+    edges = own.ravel()[surface.faces][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    key = edges.min(axis=1) * len(places) + edges.max(axis=1)
+    _, same, count = np.unique(key, return_inverse=True, return_counts=True)
+    edges = edges[count[same] == 1]
+    links = coo_array((np.ones(len(edges)), edges.T), shape=(len(places), len(places)))
+    return Borders(places[edges].astype(np.float64), connected_components(links)[1][edges[:, 0]].astype(np.int64))
+
+
+def border_scores(model: PreparedModel, photos: Sequence[PlacedPhoto]) -> Row:
+    """Return length of borders, and number and size of holes, as far as `SEEN_BY` photos see them."""
+    borders = find_borders(model.model.surface)
+    _, loop, size = np.unique(borders.loop, return_inverse=True, return_counts=True)
+    seen, widths = np.zeros((len(photos), len(loop)), bool), np.zeros((len(photos), len(loop)))
+    hole = np.zeros((len(photos), len(size)))
+    for k, photo in enumerate(photos):
+        ends, inside = _project(photo, borders.ends.reshape(-1, 3))
+        ends, inside = ends.reshape(-1, 2, 2), inside.reshape(-1, 2)
+        ways = borders.ends.mean(axis=1) - photo.center
+        seen[k] = inside.all(axis=1) & (cast_rays(model.rays, photo.center, ways)["t_hit"] > 1.0 - HIDDEN)
+        widths[k] = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / photo.camera.width
+        # y grows downward: nothing lies on the left of a loop that turns right, so it is a hole
+        area = 0.5 * np.bincount(loop, np.linalg.det(ends), len(size))
+        shown = 2 * np.bincount(loop, seen[k], len(size)) > size
+        hole[k] = np.where(shown & np.isfinite(area), np.sqrt(np.maximum(area, 0.0)), 0.0)
+    often = seen.sum(axis=0) >= SEEN_BY
+    largest = hole.max(axis=0, initial=0.0)
+    holes = (largest >= HOLE_PX) & (2 * np.bincount(loop, often, len(size)) > size)
+    return {
+        "borders, widths": round(float((np.where(seen, widths, 0.0) * often).sum() / max(len(photos), 1)), 3),
+        "holes": int(holes.sum()),
+        "largest hole px": round(float(largest[holes].max(initial=0.0)), 1),
+        "border edges": len(loop),
+    }
+
+
+def _project(photo: PlacedPhoto, points: FloatArray) -> tuple[FloatArray, Mask]:
+    """Return the pixels (N, 2) of points (N, 3), nan behind the camera, and whether they lie in the photo."""
+    R, t = photo.cam_from_world[:, :3], photo.cam_from_world[:, 3]
+    pixels = np.asarray(photo.camera.img_from_cam(points @ R.T + t), np.float64).reshape(-1, 2)
+    rim = RIM * photo.camera.width
+    size = np.array([photo.camera.width, photo.camera.height])
+    return pixels, ((pixels > rim) & (pixels < size - rim)).all(axis=1)
+
+
+def picture_scores(model: PreparedModel, photos: Sequence[PlacedPhoto]) -> Row:
+    """Return the shares of open and of wrong pixels at depth edges, and the number of speckles."""
+    edge = empty = off = area = speckles = 0
+    for photo in photos:
+        picture = render_view(model, photo)
+        covered, wrong = picture.covered, wrong_colors(picture.colors, picture.covered, photo.pixels)
+        surrounded = _closed(covered)
+        judged = _grown(depth_edges(cast_depth(model.rays, photo.center, photo.rays)), BAND_PX) & surrounded
+        edge += int(judged.sum())
+        empty += int((judged & ~covered).sum())
+        off += int((judged & wrong).sum())
+        area += int(surrounded.sum())
+        bad = (wrong | (surrounded & ~covered)).astype(np.uint8)
+        sizes = cv2.connectedComponentsWithStats(bad, connectivity=8)[2][1:, cv2.CC_STAT_AREA]
+        speckles += int((sizes < SPECKLE_PX).sum())
+    return {
+        "open %": _percent(empty, edge),
+        "off %": _percent(off, edge),
+        "open or off %": _percent(empty + off, edge),
+        "speckles per MP": round(1e6 * speckles / max(area, 1), 1),
+    }
+
+
+def wrong_colors(colors: NDArray[np.uint8], covered: Mask, photo: NDArray[np.uint8]) -> Mask:
+    """Return (H, W) where a rendering (H, W, 3) is off the photo, after a gain and an offset against exposure."""
+    if covered.sum() < LEAST_PIXELS:
+        return np.zeros_like(covered)
+    ours, theirs = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in (colors, photo))
+    gain, offset = np.polyfit(ours[covered], theirs[covered], 1) if ours[covered].std() > 1.0 else (1.0, 0.0)
+    ours, around = gain * ours + offset, np.ones((3, 3), np.uint8)
+    low, high = cv2.erode(theirs, around), cv2.dilate(theirs, around)
+    return np.asarray(covered & ((ours < low - OFF) | (ours > high + OFF)))
+
+
+def cast_depth(caster: object, center: FloatArray, rays: FloatArray) -> FloatArray:
+    """Return the depth (H, W) along rays (H, W, 3) of depth 1; inf without a surface."""
+    return np.asarray(cast_rays(caster, center, rays.reshape(-1, 3))["t_hit"], np.float64).reshape(rays.shape[:2])
+
+
+def depth_edges(depth: FloatArray) -> Mask:
+    """Return the pixels (H, W) with a neighbor on a surface behind them, or on none, by a jump of the depth."""
+    near = 1.0 / depth
+    edges = np.zeros(depth.shape, bool)
+    for axis in (0, 1):
+        a, b = np.moveaxis(near, axis, 0)[:-1], np.moveaxis(near, axis, 0)[1:]
+        np.moveaxis(edges, axis, 0)[:-1] |= a - b > JUMP * a
+        np.moveaxis(edges, axis, 0)[1:] |= b - a > JUMP * b
+    return edges
+
+
+def silhouette_scores(surface: Surface, photos: Sequence[PlacedPhoto], truth: Truth) -> Row:
+    """Return precision, recall and F of the model's silhouettes, by their distance from true ones in each photo."""
+    moved = align_centers({photo.name: photo.center for photo in photos}, truth)(surface.vertices)
+    found, true = ray_caster(moved, surface.faces), ray_caster(truth.vertices, truth.faces)
+    right, ours, met, theirs = 0, 0, 0, 0
+    for name in (photo.name for photo in photos):
+        pose, whole = truth.cam_from_world[name], truth.cameras[name]
+        shrink = min(1.0, WIDEST / whole.width)
+        width, height = round(shrink * whole.width), round(shrink * whole.height)
+        K = np.diag([width / whole.width, height / whole.height, 1.0]) @ whole.K
+        rays = (pixel_rays(Camera(K, width, height, whole.lens)) @ pose[:, :3]).reshape(height, width, 3)
+        center = camera_center(pose)
+        depth = cast_depth(true, center, rays)
+        asked = _near_seen(center + rays[::STEP, ::STEP] * depth[::STEP, ::STEP, None], truth, (width, height))
+        edges, true_edges = depth_edges(cast_depth(found, center, rays)) & asked, depth_edges(depth) & asked
+        right, ours = right + int((edges & _grown(true_edges, NEAR_PX)).sum()), ours + int(edges.sum())
+        met, theirs = met + int((true_edges & _grown(edges, NEAR_PX)).sum()), theirs + int(true_edges.sum())
+    precision, recall = _percent(right, ours), _percent(met, theirs)
+    both = round(2.0 * precision * recall / max(precision + recall, 1e-9), 2)
+    return {"silhouettes: precision %": precision, "silhouettes: recall %": recall, "silhouettes: F %": both}
+
+
+def _near_seen(places: FloatArray, truth: Truth, size: tuple[int, int]) -> Mask:
+    """Return the pixels of a photo at or beside places (h, w, 3) on a grid that enough photos see."""
+    hit = np.isfinite(places).all(axis=2)
+    seen = np.zeros(hit.shape, np.uint8)
+    seen[hit] = sights_of(truth, places[hit], None).count >= SEEN_BY
+    return _grown(cv2.resize(seen, size, interpolation=cv2.INTER_NEAREST) > 0, STEP)
+
+
+def _grown(mask: Mask, radius: float) -> Mask:
+    """Return the pixels within a radius of a mask."""
+    if not mask.any():
+        return mask
+    return np.asarray(cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= radius)
+
+
+def _closed(covered: Mask) -> Mask:
+    """Return the mask with its gaps of at most twice `GAP_PX`, without any at the rim of the photo."""
+    return covered | ~_grown(~np.pad(_grown(covered, GAP_PX), GAP_PX), GAP_PX)[GAP_PX:-GAP_PX, GAP_PX:-GAP_PX]
+
+
+def _percent(part: int, whole: int) -> float:
+    return round(100.0 * part / max(whole, 1), 2)
+
+
+def outline_scores(model: Model, photos: Sequence[PlacedPhoto], truth: Truth | None = None) -> Row:
+    """Return all figures of a model in the frame of its photos."""
+    prepared = PreparedModel(model)
+    row = border_scores(prepared, photos) | picture_scores(prepared, photos)
+    return row | (silhouette_scores(model.surface, photos, truth) if truth else {})
+
+
+def read_model(out: Path) -> Model:
+    """Read the model of a finished run in the frame of its cameras; without OUT/texture, the one of OUT/model.ply."""
+    place = Workspace(out)
+    if place.texture.exists():
+        return read_texture(place)
+    import trimesh
+
+    mesh = trimesh.load_mesh(out / "model.ply", process=False)
+    vertices = read_frame(place).from_model.inverse()(np.asarray(mesh.vertices))
+    return Model(Surface(vertices, np.asarray(mesh.faces, np.int64), np.asarray(mesh.visual.vertex_colors)[:, :3]))
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Read the command line."""
+    parser = new_parser("surface.outlines", __doc__)
+    parser.add_argument("outs", type=Path, nargs="+", metavar="OUT", help="folder of a finished run")
+    parser.add_argument("--truth", type=Path, help="folder with NAME/truth.json for an OUT of that name")
+    add_results(parser, "surface-outlines")
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Measure all models, and write the results."""
+    args, rows = parse_arguments(), []
+    for out in args.outs:
+        photos = [placed_photo(out, name, WIDEST) for name in placed_photos(out)]
+        known = args.truth and (args.truth / out.name / TRUTH_FILE).exists()
+        row: Row = {"photos": out.name, "method": "sfm-app", "placed": len(photos)}
+        rows.append(row | outline_scores(read_model(out), photos, load_truth(args.truth / out.name) if known else None))
+        print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
+    text = f"# Outlines\n\n{ABOUT}\n\n{table(rows)}"
+    write(args.results, args.name, document("surface-outlines", ABOUT, {}, {"sets": [out.name for out in args.outs]}, rows), text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
