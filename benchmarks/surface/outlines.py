@@ -50,11 +50,11 @@ BAND_PX = 3
 """Distance from a depth edge up to which pixels belong to it."""
 GAP_PX = 8
 """Half the width of a gap that the model surrounds: it closes with it. Wider ones may show the sky."""
-OFF = 10.0
-"""Difference of gray from all nine pixels of the photo around that makes a color wrong: the neighbors excuse an edge
-that lies a pixel aside, and the blur of a pixel."""
-SPECKLE_PX = 30
-"""Number of pixels from which a wrong patch is a wrong part, not a speckle."""
+FRINGE, SPECKLE = 10.0, 20.0
+"""Difference from the photo, in gray levels, of a fringe at a depth edge, and of a speckle anywhere: there, the grain
+of stone alone is off by 10."""
+SPECKLE_PX = (4, 29)
+"""Sizes of speckles in pixels: smaller ones are noise, larger ones wrong parts."""
 NEAR_PX = 1.0
 """Distance from a true silhouette at which one is right."""
 STEP = 4
@@ -66,7 +66,8 @@ ABOUT = (
     "hole: square root of its area in the photo that sees it largest. At depth edges: of the pixels within 3 px of a "
     "depth edge or outline of the model, which the model covers or surrounds; open: without surface, in gaps of at "
     "most 16 px; off: more than 10 gray levels from all nine pixels of the photo around, after a gain and an offset. "
-    "speckles: patches of open or off pixels, smaller than 30, per million pixels of the model. Silhouettes: the "
+    "speckles: patches of 4 to 29 pixels that are open or off by more than 20, per million pixels of the model; wrong "
+    "anywhere: share of all such pixels. Silhouettes: the "
     "depth edges of the model and of the truth in the true camera, once the mesh is moved onto the truth by the "
     "camera centers, near surfaces that three photos see; right: within 1 px of each other."
 )
@@ -132,36 +133,39 @@ def _project(photo: PlacedPhoto, points: FloatArray) -> tuple[FloatArray, Mask]:
 
 def picture_scores(model: PreparedModel, photos: Sequence[PlacedPhoto]) -> Row:
     """Return the shares of open and of wrong pixels at depth edges, and the number of speckles."""
-    edge = empty = off = area = speckles = 0
+    edge = empty = off = area = wrong = speckles = 0
     for photo in photos:
         picture = render_view(model, photo)
-        covered, wrong = picture.covered, wrong_colors(picture.colors, picture.covered, photo.pixels)
+        covered, errors = picture.covered, color_errors(picture.colors, picture.covered, photo.pixels)
         surrounded = _closed(covered)
         judged = _grown(depth_edges(cast_depth(model.rays, photo.center, photo.rays)), BAND_PX) & surrounded
         edge += int(judged.sum())
         empty += int((judged & ~covered).sum())
-        off += int((judged & wrong).sum())
-        area += int(surrounded.sum())
-        bad = (wrong | (surrounded & ~covered)).astype(np.uint8)
-        sizes = cv2.connectedComponentsWithStats(bad, connectivity=8)[2][1:, cv2.CC_STAT_AREA]
-        speckles += int((sizes < SPECKLE_PX).sum())
+        off += int((judged & (errors > FRINGE)).sum())
+        bad = (errors > SPECKLE) | (surrounded & ~covered)
+        area, wrong = area + int(surrounded.sum()), wrong + int(bad.sum())
+        sizes = cv2.connectedComponentsWithStats(bad.astype(np.uint8), connectivity=8)[2][1:, cv2.CC_STAT_AREA]
+        speckles += int(((sizes >= SPECKLE_PX[0]) & (sizes <= SPECKLE_PX[1])).sum())
     return {
         "open %": _percent(empty, edge),
         "off %": _percent(off, edge),
         "open or off %": _percent(empty + off, edge),
         "speckles per MP": round(1e6 * speckles / max(area, 1), 1),
+        "wrong anywhere %": _percent(wrong, area),
     }
 
 
-def wrong_colors(colors: NDArray[np.uint8], covered: Mask, photo: NDArray[np.uint8]) -> Mask:
-    """Return (H, W) where a rendering (H, W, 3) is off the photo, after a gain and an offset against exposure."""
-    if covered.sum() < LEAST_PIXELS:
-        return np.zeros_like(covered)
-    ours, theirs = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in (colors, photo))
-    gain, offset = np.polyfit(ours[covered], theirs[covered], 1) if ours[covered].std() > 1.0 else (1.0, 0.0)
-    ours, around = gain * ours + offset, np.ones((3, 3), np.uint8)
-    low, high = cv2.erode(theirs, around), cv2.dilate(theirs, around)
-    return np.asarray(covered & ((ours < low - OFF) | (ours > high + OFF)))
+def color_errors(colors: NDArray[np.uint8], covered: Mask, photo: NDArray[np.uint8]) -> FloatArray:
+    """Return by how many gray levels a rendering (H, W, 3) is off its photo (H, W), after a gain and an offset.
+
+    The error is that to the range of the nine pixels around: they excuse blur, and an edge that lies a pixel aside.
+    """
+    ours, theirs = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float64) for image in (colors, photo))
+    if covered.sum() >= LEAST_PIXELS and ours[covered].std() > 1.0:
+        ours = np.polyval(np.polyfit(ours[covered], theirs[covered], 1), ours)
+    around = np.ones((3, 3), np.uint8)
+    errors = np.maximum(cv2.erode(theirs, around) - ours, ours - cv2.dilate(theirs, around))
+    return np.where(covered, np.maximum(errors, 0.0), 0.0)
 
 
 def cast_depth(caster: object, center: FloatArray, rays: FloatArray) -> FloatArray:
@@ -264,7 +268,12 @@ def main() -> None:
         rows.append(row | outline_scores(read_model(out), photos, load_truth(args.truth / out.name) if known else None))
         print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     text = f"# Outlines\n\n{ABOUT}\n\n{table(rows)}"
-    write(args.results, args.name, document("surface-outlines", ABOUT, {}, {"sets": [out.name for out in args.outs]}, rows), text)
+    write(
+        args.results,
+        args.name,
+        document("surface-outlines", ABOUT, {}, {"sets": [out.name for out in args.outs]}, rows),
+        text,
+    )
     print(text)
 
 
