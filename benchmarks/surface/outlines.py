@@ -161,8 +161,10 @@ def color_errors(colors: NDArray[np.uint8], covered: Mask, photo: NDArray[np.uin
     The error is that to the range of the nine pixels around: they excuse blur, and an edge that lies a pixel aside.
     """
     ours, theirs = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float64) for image in (colors, photo))
-    if covered.sum() >= LEAST_PIXELS and ours[covered].std() > 1.0:
-        ours = np.polyval(np.polyfit(ours[covered], theirs[covered], 1), ours)
+    if covered.sum() >= LEAST_PIXELS:
+        # what is wrong moves a least-squares fit, but not the shares of dark and bright
+        (dark, bright), (low, high) = (np.percentile(gray[covered], (10, 90)) for gray in (ours, theirs))
+        ours = low + (ours - dark) * ((high - low) / (bright - dark) if bright > dark else 1.0)
     around = np.ones((3, 3), np.uint8)
     errors = np.maximum(cv2.erode(theirs, around) - ours, ours - cv2.dilate(theirs, around))
     return np.where(covered, np.maximum(errors, 0.0), 0.0)
