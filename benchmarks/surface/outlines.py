@@ -9,6 +9,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -19,14 +20,14 @@ from scipy.sparse.csgraph import connected_components
 
 from benchmarks.common.command_line import add_results, new_parser
 from benchmarks.common.results import Row, document, table, write
-from benchmarks.surface.photos import LEAST_PIXELS, PlacedPhoto, placed_photo, placed_photos, render_view
+from benchmarks.surface.photos import LEAST_PIXELS, PlacedPhoto, placed_photo, placed_photos
 from benchmarks.surface.rendered.truth import sights_of
 from sfm_app.products import read_frame, read_texture
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.synthetic.cameras import Camera, pixel_rays
 from sfm_app.synthetic.compare import align_centers
 from sfm_app.synthetic.photo_folder import TRUTH_FILE, Truth, load_truth
-from sfm_app.synthetic.render import PreparedModel, cast_rays, ray_caster
+from sfm_app.synthetic.render import PreparedModel, cast_rays, ray_caster, render_rays
 from sfm_app.types import Surface
 from sfm_app.types.scene import camera_center
 from sfm_app.types.surface import Model
@@ -53,6 +54,8 @@ GAP_PX = 8
 FRINGE, SPECKLE = 10.0, 20.0
 """Difference from the photo, in gray levels, of a fringe at a depth edge, and of a speckle anywhere: there, the grain
 of stone alone is off by 10."""
+AROUND_PX = 31
+"""Width of the window whose median difference excuses sheen: a speckle fills a thirtieth of it."""
 SPECKLE_PX = (4, 29)
 """Sizes of speckles in pixels: smaller ones are noise, larger ones wrong parts."""
 NEAR_PX = 1.0
@@ -135,15 +138,16 @@ def picture_scores(model: PreparedModel, photos: Sequence[PlacedPhoto]) -> Row:
     """Return the shares of open and of wrong pixels at depth edges, and the number of speckles."""
     edge = empty = off = area = wrong = speckles = 0
     for photo in photos:
-        picture = render_view(model, photo)
-        covered, errors = picture.covered, color_errors(picture.colors, picture.covered, photo.pixels)
+        colors, covered = render_smoothly(model, photo)
+        errors, local = color_errors(colors, covered, photo.pixels)
         surrounded = _closed(covered)
         judged = _grown(depth_edges(cast_depth(model.rays, photo.center, photo.rays)), BAND_PX) & surrounded
         edge += int(judged.sum())
         empty += int((judged & ~covered).sum())
         off += int((judged & (errors > FRINGE)).sum())
-        bad = (errors > SPECKLE) | (surrounded & ~covered)
-        area, wrong = area + int(surrounded.sum()), wrong + int(bad.sum())
+        area += int(surrounded.sum())
+        wrong += int(((errors > SPECKLE) | (surrounded & ~covered)).sum())
+        bad = (local > SPECKLE) | (surrounded & ~covered)
         sizes = cv2.connectedComponentsWithStats(bad.astype(np.uint8), connectivity=8)[2][1:, cv2.CC_STAT_AREA]
         speckles += int(((sizes >= SPECKLE_PX[0]) & (sizes <= SPECKLE_PX[1])).sum())
     return {
@@ -155,10 +159,21 @@ def picture_scores(model: PreparedModel, photos: Sequence[PlacedPhoto]) -> Row:
     }
 
 
-def color_errors(colors: NDArray[np.uint8], covered: Mask, photo: NDArray[np.uint8]) -> FloatArray:
-    """Return by how many gray levels a rendering (H, W, 3) is off its photo (H, W), after a gain and an offset.
+def render_smoothly(model: PreparedModel, photo: PlacedPhoto) -> tuple[NDArray[np.uint8], Mask]:
+    """Return colors (H, W, 3) as means of four rays a pixel, for fine textures, and whether two rays meet the model."""
+    down, right = np.gradient(photo.rays, axis=(0, 1))
+    total, count = np.zeros(photo.rays.shape), np.zeros(photo.rays.shape[:2])
+    for dy, dx in product((-0.25, 0.25), repeat=2):
+        picture = render_rays(model, photo.center, photo.rays + dy * down + dx * right)
+        total, count = total + picture.colors, count + picture.covered
+    return (total / np.maximum(count, 1)[..., None]).astype(np.uint8), count >= 2
 
-    The error is that to the range of the nine pixels around: they excuse blur, and an edge that lies a pixel aside.
+
+def color_errors(colors: NDArray[np.uint8], covered: Mask, photo: NDArray[np.uint8]) -> tuple[FloatArray, FloatArray]:
+    """Return by how many gray levels a rendering (H, W, 3) is off its photo, after a gain and an offset, and locally.
+
+    Both (H, W) are errors to the range of the nine pixels around: they excuse blur, and an edge that lies a pixel
+    aside. The second is that of the rendering plus its median difference from the photo around: sheen is excused.
     """
     ours, theirs = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float64) for image in (colors, photo))
     if covered.sum() >= LEAST_PIXELS:
@@ -166,8 +181,11 @@ def color_errors(colors: NDArray[np.uint8], covered: Mask, photo: NDArray[np.uin
         (dark, bright), (low, high) = (np.percentile(gray[covered], (10, 90)) for gray in (ours, theirs))
         ours = low + (ours - dark) * ((high - low) / (bright - dark) if bright > dark else 1.0)
     around = np.ones((3, 3), np.uint8)
-    errors = np.maximum(cv2.erode(theirs, around) - ours, ours - cv2.dilate(theirs, around))
-    return np.where(covered, np.maximum(errors, 0.0), 0.0)
+    least, most = cv2.erode(theirs, around), cv2.dilate(theirs, around)
+    difference = np.where(covered, np.clip(theirs - ours + 127.5, 0.0, 255.0), 127.5).astype(np.uint8)
+    sheen = cv2.medianBlur(difference, AROUND_PX).astype(np.float64) - 127.0
+    errors, local = (np.maximum(np.maximum(least - own, own - most), 0.0) for own in (ours, ours + sheen))
+    return np.where(covered, errors, 0.0), np.where(covered, local, 0.0)
 
 
 def cast_depth(caster: object, center: FloatArray, rays: FloatArray) -> FloatArray:
