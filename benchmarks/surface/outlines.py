@@ -166,7 +166,7 @@ def render_smoothly(model: PreparedModel, photo: PlacedPhoto) -> tuple[NDArray[n
     for dy, dx in product((-0.25, 0.25), repeat=2):
         picture = render_rays(model, photo.center, photo.rays + dy * down + dx * right)
         total, count = total + picture.colors, count + picture.covered
-    return (total / np.maximum(count, 1)[..., None]).astype(np.uint8), count >= 2
+    return (total / np.maximum(count, 1)[..., None]).astype(np.uint8), np.asarray(count >= 2)
 
 
 def color_errors(colors: NDArray[np.uint8], covered: Mask, photo: NDArray[np.uint8]) -> tuple[FloatArray, FloatArray]:
