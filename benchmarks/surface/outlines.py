@@ -131,7 +131,7 @@ def _project(photo: PlacedPhoto, points: FloatArray) -> tuple[FloatArray, Mask]:
     pixels = np.asarray(photo.camera.img_from_cam(points @ R.T + t), np.float64).reshape(-1, 2)
     rim = RIM * photo.camera.width
     size = np.array([photo.camera.width, photo.camera.height])
-    return pixels, ((pixels > rim) & (pixels < size - rim)).all(axis=1)
+    return pixels, np.asarray(((pixels > rim) & (pixels < size - rim)).all(axis=1))
 
 
 def picture_scores(model: PreparedModel, photos: Sequence[PlacedPhoto]) -> Row:
