@@ -111,7 +111,8 @@ def border_scores(model: PreparedModel, photos: Sequence[PlacedPhoto]) -> Row:
         seen[k] = inside.all(axis=1) & (cast_rays(model.rays, photo.center, ways)["t_hit"] > 1.0 - HIDDEN)
         widths[k] = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / photo.camera.width
         # y grows downward: nothing lies on the left of a loop that turns right, so it is a hole
-        area = 0.5 * np.bincount(loop, np.linalg.det(ends), len(size))
+        turn = ends[:, 0, 0] * ends[:, 1, 1] - ends[:, 0, 1] * ends[:, 1, 0]
+        area = 0.5 * np.bincount(loop, turn, len(size))
         shown = 2 * np.bincount(loop, seen[k], len(size)) > size
         hole[k] = np.where(shown & np.isfinite(area), np.sqrt(np.maximum(area, 0.0)), 0.0)
     often = seen.sum(axis=0) >= SEEN_BY
