@@ -288,13 +288,10 @@ def main() -> None:
         row: Row = {"photos": out.name, "method": "sfm-app", "placed": len(photos)}
         rows.append(row | outline_scores(read_model(out), photos, load_truth(args.truth / out.name) if known else None))
         print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
-    text = f"# Outlines\n\n{ABOUT}\n\n{table(rows)}"
-    write(
-        args.results,
-        args.name,
-        document("surface-outlines", ABOUT, {}, {"sets": [out.name for out in args.outs]}, rows),
-        text,
-    )
+    columns = dict.fromkeys(key for row in rows for key in row if key != "method")
+    text = f"# Outlines\n\n{ABOUT}\n\n{table(rows, list(columns))}"
+    found = document("surface-outlines", ABOUT, {}, {"sets": [row["photos"] for row in rows]}, rows)
+    write(args.results, args.name, found, text)
     print(text)
 
 
