@@ -63,16 +63,16 @@ NEAR_PX = 1.0
 STEP = 4
 """Distance in pixels of the places that decide what other photos see."""
 ABOUT = (
-    "Finished models, rendered into the cameras of their photos at 1600 pixels of width or less. borders: length of "
-    "the model's borders that three photos see (in the photo, not hidden, not at its rim), as far as each photo sees "
-    "them, in photo widths, mean over the photos; holes: closed ones of at least 2 pixels around nothing; largest "
-    "hole: square root of its area in the photo that sees it largest. At depth edges: of the pixels within 3 px of a "
-    "depth edge or outline of the model, which the model covers or surrounds; open: without surface, in gaps of at "
-    "most 16 px; off: more than 10 gray levels from all nine pixels of the photo around, after a gain and an offset. "
-    "speckles: patches of 4 to 29 pixels that are open or off by more than 20, per million pixels of the model; wrong "
-    "anywhere: share of all such pixels. Silhouettes: the "
-    "depth edges of the model and of the truth in the true camera, once the mesh is moved onto the truth by the "
-    "camera centers, near surfaces that three photos see; right: within 1 px of each other."
+    "Finished models, rendered into the cameras of their photos with four rays a pixel, at 1600 pixels of width or "
+    "less. borders: length of the model's borders that three photos see (in the photo, not hidden, not at its rim), as "
+    "far as each photo sees them, in photo widths, mean over the photos; holes: closed ones of at least 2 pixels "
+    "around nothing; largest hole: square root of its area in the photo that sees it largest. At depth edges: of the "
+    "pixels within 3 px of a depth edge or outline of the model, which the model covers or surrounds; open: without "
+    "surface, in gaps of at most 16 px; off: more than 10 gray levels from all nine pixels of the photo around, after "
+    "a gain and an offset. wrong anywhere: share of pixels that are open or off by more than 20. speckles: patches of "
+    "4 to 29 of them, once the median difference of 31 pixels around is taken out, per million pixels of the model. "
+    "Silhouettes: the depth edges of the model and of the truth in the true camera, once the mesh is moved onto the "
+    "truth by the camera centers, near surfaces that three photos see; right: within 1 px of each other."
 )
 
 
