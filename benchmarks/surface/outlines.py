@@ -46,7 +46,9 @@ HIDDEN = 5e-3
 HOLE_PX = 2.0
 """Least side of the square of a hole's area in some photo: a smaller one is not seen."""
 JUMP = 0.01
-"""Change of depth from pixel to pixel at a depth edge: a plane has it where it is seen at 4 degrees."""
+"""Change of the depth from pixel to pixel at a depth edge: a plane has it where it is seen at 4 degrees."""
+THING = 0.03
+"""The same at the silhouette of a thing before another: the gravel of a path has jumps of 1 %."""
 BAND_PX = 3
 """Distance from a depth edge up to which pixels belong to it."""
 GAP_PX = 8
@@ -71,8 +73,9 @@ ABOUT = (
     "surface, in gaps of at most 16 px; off: more than 10 gray levels from all nine pixels of the photo around, after "
     "a gain and an offset. wrong anywhere: share of pixels that are open or off by more than 20. speckles: patches of "
     "4 to 29 of them, once the median difference of 31 pixels around is taken out, per million pixels of the model. "
-    "Silhouettes: the depth edges of the model and of the truth in the true camera, once the mesh is moved onto the "
-    "truth by the camera centers, near surfaces that three photos see; right: within 1 px of each other."
+    "Silhouettes: the outlines of model and truth, and where their depth jumps by 3 %, in the true camera, once the "
+    "mesh is moved onto the truth by the camera centers, near surfaces that three photos see; right: within 1 px of "
+    "each other."
 )
 
 
@@ -194,14 +197,14 @@ def cast_depth(caster: object, center: FloatArray, rays: FloatArray) -> FloatArr
     return np.asarray(cast_rays(caster, center, rays.reshape(-1, 3))["t_hit"], np.float64).reshape(rays.shape[:2])
 
 
-def depth_edges(depth: FloatArray) -> Mask:
+def depth_edges(depth: FloatArray, jump: float = JUMP) -> Mask:
     """Return the pixels (H, W) with a neighbor on a surface behind them, or on none, by a jump of the depth."""
     near = 1.0 / depth
     edges = np.zeros(depth.shape, bool)
     for axis in (0, 1):
         a, b = np.moveaxis(near, axis, 0)[:-1], np.moveaxis(near, axis, 0)[1:]
-        np.moveaxis(edges, axis, 0)[:-1] |= a - b > JUMP * a
-        np.moveaxis(edges, axis, 0)[1:] |= b - a > JUMP * b
+        np.moveaxis(edges, axis, 0)[:-1] |= a - b > jump * a
+        np.moveaxis(edges, axis, 0)[1:] |= b - a > jump * b
     return edges
 
 
@@ -219,7 +222,7 @@ def silhouette_scores(surface: Surface, photos: Sequence[PlacedPhoto], truth: Tr
         center = camera_center(pose)
         depth = cast_depth(true, center, rays)
         asked = _near_seen(center + rays[::STEP, ::STEP] * depth[::STEP, ::STEP, None], truth, (width, height))
-        edges, true_edges = depth_edges(cast_depth(found, center, rays)) & asked, depth_edges(depth) & asked
+        edges, true_edges = (depth_edges(z, THING) & asked for z in (cast_depth(found, center, rays), depth))
         right, ours = right + int((edges & _grown(true_edges, NEAR_PX)).sum()), ours + int(edges.sum())
         met, theirs = met + int((true_edges & _grown(edges, NEAR_PX)).sum()), theirs + int(true_edges.sum())
     precision, recall = _percent(right, ours), _percent(met, theirs)
