@@ -17,13 +17,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from sfm_app.camera.models import PARAMETERS, calibration_from_model
 from sfm_app.errors import InputError
 from sfm_app.files import decode_text, fingerprint, read_bytes, read_text
 from sfm_app.numerical import finite_entries
 from sfm_app.types import Calibration, GivenCameras
+from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import GIVEN, PROJECTIONS
 
 Cameras = tuple[dict[str, Calibration], dict[str, str]]
@@ -170,9 +170,7 @@ def _distortion(values: Mapping[str, Any]) -> list[float]:
         return [float(plain.get(name) or 0.0) for name in TERMS]
     unknown = [name for name in plain.keys() - {*MATRIX, *SIZE, *OTHER_KEYS} if _length(plain[name]) in COUNTS]
     if unknown:
-        raise ValueError(
-            f"'{min(unknown)}' beside the camera matrix may be its distortion: call it dist_coeffs, or remove it"
-        )
+        raise ValueError(f"'{min(unknown)}' may be the distortion: call it dist_coeffs, or remove it")
     return []
 
 
@@ -251,7 +249,7 @@ def _value(values: Mapping[str, Any], names: Sequence[str]) -> Any:
     return next((plain[name] for name in names if plain.get(name) is not None), None)
 
 
-def _numbers(value: Any, what: str) -> NDArray[np.float64]:
+def _numbers(value: Any, what: str) -> FloatArray:
     """Return numbers from nested lists, or from a mapping with "data", as ROS and OpenCV write matrices."""
     if isinstance(value, Mapping):
         value = value.get("data")
@@ -408,11 +406,7 @@ RUN_FILES = ("scene.json", "calibration.json")
 
 
 def read_given_cameras(path: Path) -> GivenCameras:
-    """Read a calibration file of any known form, or a folder that holds one.
-
-    Raises:
-        InputError: it is missing, of no known form, or holds values that are no camera.
-    """
+    """Read a calibration file of any known form, or a folder that holds one; an InputError says what is wrong."""
     try:
         form, (cameras, camera_of) = _read_folder(path) if path.is_dir() else _read_file(path)
         if not cameras:

@@ -18,11 +18,7 @@ from typing import ClassVar
 
 
 class SfmError(Exception):
-    """Base class: one line about the error, and one about the remedy.
-
-    Args:
-        photos: reason by photo.
-    """
+    """Base class: one line about the error, one about the remedy, and the reasons by photo."""
 
     exit_code: ClassVar[int] = 1
 

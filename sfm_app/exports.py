@@ -42,6 +42,7 @@ from sfm_app.pipeline import MESH, SCALE, SCENE, TEXTURE
 from sfm_app.products import read_photo_list
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Model, Scene, SceneArrays
+from sfm_app.types.arrays import FloatArray
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
 from sfm_app.wording import list_names
 
@@ -110,7 +111,7 @@ def stored_arrays(run: RunContext) -> SceneArrays:
     return model_arrays(model, metric=stored_frame(run).is_metric)
 
 
-def stored_distance(run: RunContext, ends: NDArray[np.float64]) -> Distance:
+def stored_distance(run: RunContext, ends: FloatArray) -> Distance:
     """Return the distance between two places, (2, 3) in the frame of exports; ValueError if both are the same."""
     check_finished(run, [SCENE], "camera poses")
     frame = stored_frame(run)
@@ -145,7 +146,7 @@ def stored_cloud(run: RunContext) -> PointCloud:
     return PointCloud(points, colors, normals)
 
 
-def _columns(records: NDArray[np.void], names: Sequence[str]) -> NDArray[np.float64]:
+def _columns(records: NDArray[np.void], names: Sequence[str]) -> FloatArray:
     return np.stack([records[name] for name in names], axis=1).astype(np.float64)
 
 
@@ -283,10 +284,7 @@ ELSEWHERE = "name another place with -o"
 
 @contextmanager
 def fill_folder(target: Path, about: Callable[[], Mapping[str, object]]) -> Iterator[Path]:
-    """Provide an empty folder beside `target`, which replaces it when the block ends without an error.
-
-    The target may be an earlier export; `about` returns the entries of the record besides the files, at the end.
-    """
+    """Provide an empty folder that replaces `target` at the end, with a record of `about` and its files."""
     check_replaceable(target)
     with replace_folder(target) as draft:
         yield draft
@@ -308,17 +306,12 @@ def check_replaceable(target: Path) -> None:
 
 
 def check_parts(main: Path, parts: Sequence[str]) -> None:
-    """Check that the other files of a model are missing, or parts of an earlier export to `main`; InputError if not.
-
-    The user has only named the main file. An earlier one names its parts.
-    """
+    """Check that the other files of a model are missing, or parts of an earlier export to `main`; InputError if not."""
     present = [path for name in parts if (path := main.with_name(name)).exists()]
     named = b"".join(_beginning(path) for path in (main, *present) if path.is_file())
     foreign = [path.name for path in present if path.name.encode() not in named]
     if foreign:
-        raise InputError(
-            f"{foreign[0]} beside {main} is no part of an earlier export, and would be lost", hint=ELSEWHERE
-        )
+        raise InputError(f"{foreign[0]} beside {main} is no part of an earlier export", hint=ELSEWHERE)
 
 
 def _beginning(path: Path) -> bytes:

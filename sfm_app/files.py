@@ -117,11 +117,7 @@ times with zeros. By hand."""
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an .npz file; pickled objects, which could run code, are refused.
-
-    Raise an OSError if it cannot be read, a ValueError if it is no such file or exceeds the limits. Damaged files raise
-    many other errors.
-    """
+    """Return the arrays of an .npz file, no pickles; OSError or ValueError if it is none or exceeds the limits."""
     # opened here, because NumPy leaves a damaged file open
     with path.open("rb") as file:
         with ZipFile(file) as members:

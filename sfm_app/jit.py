@@ -66,10 +66,7 @@ def _compile(function: Function, **options: Any) -> Function:
 
 @contextlib.contextmanager
 def warming_up(say: Callable[[str], None], warm: Path = WARM) -> Iterator[None]:
-    """Compile all kernels in another process during the block, unless `warm` exists.
-
-    The block does not wait: it takes kernels from the cache, and compiles the others itself.
-    """
+    """Compile all kernels in another process during the block, which does not wait, unless `warm` exists."""
     if warm.exists() or PARENT in os.environ:
         yield
         return

@@ -89,10 +89,7 @@ WAITS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 
 
 def link_or_copy(place: Path, target: Path | str, source: Path) -> None:
-    """Make a link with the text `target` to the file `source`, or a copy if links are not possible.
-
-    A copy is no hard link: a program that writes to it must not change the user's file.
-    """
+    """Make a link with the text `target` to the file `source`, or a copy, which programs may write to."""
     if not lacks(Ability.LINKS):
         try:
             place.symlink_to(target)

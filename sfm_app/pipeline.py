@@ -16,13 +16,12 @@ from sfm_app.errors import ConfigError, InputError
 from sfm_app.frame.control_points import read_control_points
 from sfm_app.frame.positions import GEO_TXT, read_positions
 from sfm_app.frame.scale import MetricFrame
-from sfm_app.photos.gather import expand, fill, find, is_single
+from sfm_app.photos.gather import expand, fill, find, is_single, remove
 from sfm_app.photos.source import Source, read_source
 from sfm_app.runtime.context import CONTROL_POINTS, GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.stages import depth_maps, files, intrinsics, match_graph, mesh, photos, scale, scene, texture, view_graph
 from sfm_app.types import GpsPosition, Intrinsics, MatchGraph, Model, PhotoSet, Scene, Surface, ViewGraph
-from sfm_app.wording import list_names
 
 PHOTOS: Stage[PhotoSet] = Stage(
     name="photos",
@@ -149,7 +148,11 @@ def _open_source(inputs: Sequence[Path], run: RunContext) -> Iterator[Source]:
     options, place = run.settings.photos, run.workspace
     spread = partial(ordered_map, run.executor, ahead=4 * run.workers)
     if is_single(inputs, place.root):
-        yield read_source(inputs[0], place.root, options, spread)
+        source = read_source(inputs[0], place.root, options, spread)
+        if place.inputs.exists():  # of an earlier run
+            with place.hold_lock():
+                remove(place.inputs)
+        yield source
         return
     if options.images:
         raise ConfigError("--images lists photos of one folder", hint="leave --images out")
@@ -177,20 +180,19 @@ def _with_positions(source: Source, run: RunContext) -> Source:
         given = [(Path(run.settings.photos.positions), "")]
     elif not all(path.is_file() for path, _ in given):
         return source
-    known: dict[str, GpsPosition] = {}
+    known, absent = dict[str, GpsPosition](), dict[str, list[str]]()
     for path, folder in given:
         inside = [name.removeprefix(folder) for name in source.files if name and name.startswith(folder)]
         place = source.named.get(f"{folder}{GEO_TXT}", str(path))
         try:
-            positions, missing = read_positions(path, inside)
+            positions, absent[place if source.named else path.name] = read_positions(path, inside)
         except InputError as err:
             raise InputError(err.message.replace(str(path), place), hint=err.hint) from err
-        if missing:
-            run.progress.say(f"{place} names photos that the folder does not have: {list_names(missing, 5)}")
         for name, position in positions.items():
             if known.setdefault(folder + name, position) != position:
                 label = source.label(folder + name)
                 raise InputError(f"two geo.txt give {label} other positions", hint="name one file with --positions")
     places = {path.resolve() for path, _ in given}
     files = {name: digest for name, digest in source.files.items() if (source.path / name).resolve() not in places}
-    return replace(source, files=files, positions=known)
+    missing = {place: names for place, names in absent.items() if names}
+    return replace(source, files=files, positions=known, missing=missing)

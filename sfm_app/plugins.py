@@ -237,9 +237,7 @@ def _load(modules: Sequence[ModuleType | object], installed: bool) -> Plugins:
             manager.load_setuptools_entrypoints(GROUP)
         manager.check_pending()
     except Exception as err:  # a plug-in may raise anything on import
-        raise PluginError(
-            f"a plug-in does not load: {err}", hint="update or uninstall it; hooks: sfm_app.plugins.Hooks"
-        ) from err
+        raise PluginError(f"a plug-in does not load: {err}", hint="update or uninstall it") from err
     exporters = _index_by_name(manager.hook.sfm_exporters())
     return Plugins(
         estimators=_index_by_name(manager.hook.sfm_estimators()),

@@ -45,10 +45,7 @@ Callback = Callable[[Step], None]
 
 
 class CallbackProgress(Progress):
-    """A display that calls a function with every step, in the thread of the run.
-
-    An exception from the function ends the run, which can be resumed.
-    """
+    """A display that calls a function with every step, in the thread of the run."""
 
     def __init__(self, callback: Callback) -> None:
         self.callback = callback

@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from sfm_app.settings import MatchSettings
 from sfm_app.types import MatchedImage, PairId
-from sfm_app.types.arrays import IndexArray
+from sfm_app.types.arrays import ByteArray, Float32Array, IndexArray
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -21,8 +20,7 @@ if TYPE_CHECKING:
 # photos are the neighbors, which add no parallax; less similar photos of the same place hold a model together.
 
 
-@dataclass(frozen=True, slots=True)
-class RetrievalOptions:
+class OPTIONS:
     """Choice of partners, previews and vocabulary."""
 
     nearest_share: float = 0.4
@@ -40,7 +38,6 @@ class RetrievalOptions:
     """Descriptors from which a word is learned, on average. Chosen by hand."""
 
 
-OPTIONS = RetrievalOptions()
 BLOCK = 256
 """Photos whose keypoints or similarities are in memory at once; no result depends on it. Chosen by hand."""
 
@@ -164,7 +161,7 @@ def _pair(a: int, b: int) -> PairId:
     return (a, b) if a < b else (b, a)
 
 
-def describe_picture(pixels: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:
+def describe_picture(pixels: ByteArray, most: int) -> ByteArray:
     """Return at most `most` SIFT descriptors (N, 128) of an (H, W, 3) RGB picture, the largest features first."""
     import cv2  # an estimate of the cost needs none of these libraries
 
@@ -197,7 +194,7 @@ def count_preview_matches(first: DescriptorArray, others: Sequence[DescriptorArr
     return [_count_mutual(squares[:, start:end]) for start, end in pairwise(ends)]
 
 
-def _count_mutual(squares: NDArray[np.float32]) -> int:
+def _count_mutual(squares: Float32Array) -> int:
     """Count the rows of squared distances (N, M) whose clear minimum is also that of its column; changes them."""
     if min(squares.shape) < 2:
         return 0
@@ -248,7 +245,7 @@ def _weigh(words: Sequence[IndexArray], size: int) -> "csr_array":
 # and with any number of threads.
 
 
-def learn_vocabulary(descriptors: DescriptorArray, size: int, seed: int) -> NDArray[np.float32]:
+def learn_vocabulary(descriptors: DescriptorArray, size: int, seed: int) -> Float32Array:
     """Learn visual words by k-means in two levels from descriptors (N, 128), N > 0, of all photos.
 
     Returns (K, 128), K <= `size`, the centers of clusters: whole numbers, 0 to 255.
@@ -264,7 +261,7 @@ def learn_vocabulary(descriptors: DescriptorArray, size: int, seed: int) -> NDAr
     return np.unique(np.concatenate(leaves), axis=0)
 
 
-def _cluster(data: NDArray[np.float32], count: int, rng: np.random.Generator) -> NDArray[np.float32]:
+def _cluster(data: Float32Array, count: int, rng: np.random.Generator) -> Float32Array:
     """Return the centers of clusters, rounded to whole numbers; fewer where there are fewer data."""
     centers = np.unique(data[rng.permutation(len(data))[:count]], axis=0)
     for _ in range(OPTIONS.rounds):
@@ -280,7 +277,7 @@ def _cluster(data: NDArray[np.float32], count: int, rng: np.random.Generator) ->
     return centers
 
 
-def nearest_words(words: NDArray[np.float32], descriptors: NDArray[np.uint8 | np.float32]) -> IndexArray:
+def nearest_words(words: Float32Array, descriptors: NDArray[np.uint8 | np.float32]) -> IndexArray:
     """Return (N,) rows of the words that are nearest to the descriptors (N, 128); of equal ones the first."""
     half = 0.5 * np.einsum("kd,kd->k", words, words)
     nearest = np.empty(len(descriptors), np.int64)

@@ -44,16 +44,11 @@ class PhotoSettings(Section):
     """Photos, and cameras that they share."""
 
     images: str = Field("", description="text file that names the photos to use, one per line; all where empty")
-    masks: str = Field(
-        "", description="folder of masks, such as sub/a.jpg.png, or one mask of all photos; black areas are left out"
-    )
-    positions: str = Field(
-        "", description="file with positions of photos, as OpenDroneMap's geo.txt; where empty, geo.txt beside them"
-    )
+    masks: str = Field("", description="folder of masks, such as sub/a.jpg.png, or one for all; black is left out")
+    positions: str = Field("", description="positions, as OpenDroneMap's geo.txt; if empty, geo.txt beside the photos")
     cameras: Literal["auto", "single", "folder", "each"] = Field(
         "auto",
-        description="auto: same size and same EXIF camera share one; single: all share one; folder: those of a folder; "
-        "each: none share",
+        description="auto: same size and EXIF camera share one; single: all do; folder: those of a folder; each: none",
     )
     max_frames: int = Field(100, ge=2, le=2000, description="most frames of a video that are used")
     keep_low_quality: bool = Field(False, description="use copies, blurred photos and screenshots, too")
@@ -65,24 +60,14 @@ class MatchSettings(Section):
     """Features and matches."""
 
     features: str = Field("sift", description="name of the feature method (see `sfm-app plugins`)")
-    max_image_size_px: int = Field(
-        1600, ge=128, le=16384, description="longer side at which features are found, in pixels"
-    )
+    max_image_size_px: int = Field(1600, ge=128, le=16384, description="longer side for features, in pixels")
     max_features: int = Field(8192, ge=100, le=100000, description="most features per photo")
     enlarge_below: int = Field(
-        4000,
-        ge=0,
-        le=100000,
-        description="photos with fewer features are searched again at twice their area, with half as many at twice "
-        "their size; for SIFT",
+        4000, ge=0, le=100000, description="photos with fewer features are searched again at twice their area or size"
     )
-    max_ratio: float = Field(
-        0.8, gt=0, le=1, description="largest nearest over second nearest descriptor distance, for SIFT; 1: no limit"
-    )
+    max_ratio: float = Field(0.8, gt=0, le=1, description="largest ratio of the two nearest distances of SIFT; 1: any")
     pairs: Literal["auto", "all", "retrieval", "sequence"] = Field(
-        "auto",
-        description="pairs to match: all; retrieval: photos that look alike; sequence: mostly neighbors by name or "
-        "time; auto: all where that is cheaper, else retrieval",
+        "auto", description="all; retrieval: photos that look alike; sequence: neighbors; auto: all or retrieval"
     )
     neighbors: int = Field(30, ge=4, le=1000, description="photos to match with each one, where not all are")
 
@@ -90,16 +75,13 @@ class MatchSettings(Section):
 class EpipolarSettings(Section):
     """Fundamental matrices, one per pair of photos."""
 
-    estimator: str = Field(
-        "lev-ransac", description="name of the estimator of fundamental matrices (see `sfm-app plugins`)"
-    )
+    estimator: str = Field("lev-ransac", description="estimator of fundamental matrices (see `sfm-app plugins`)")
     max_error_px: float = Field(1.5, gt=0, le=100, description="inlier threshold on the Sampson distance, in pixels")
     confidence: float = Field(0.9999, gt=0, lt=1, description="required probability that a sample is free of outliers")
     max_trials: int = Field(20000, ge=1, le=10_000_000, description="most minimal samples per pair")
     min_inliers: int = Field(16, ge=8, le=10000, description="a pair with fewer inliers is rejected")
     refit: Literal["auto", "eight-point", "sampson", "reprojection"] = Field(
-        "auto",
-        description="error that a final refit to the inliers minimizes; auto: no refit after the estimator's own",
+        "auto", description="error that a last refit minimizes; auto: none"
     )
 
 
@@ -107,41 +89,16 @@ class CalibrationSettings(Section):
     """The camera matrix from the fundamental matrices."""
 
     calibrator: str = Field("zero-curves", description="name of the calibrator (see `sfm-app plugins`)")
-    samples: int = Field(
-        100, ge=10, le=10000, description="samples along one zero curve; only `zero-curves-thesis` uses it"
-    )
+    samples: int = Field(100, ge=10, le=10000, description="samples along a curve of `zero-curves-thesis`")
     constraint_form: ConstraintForm = Field(
-        "huang-faugeras",
-        description="constraint that the thesis's least-squares calibrators minimize: huang-faugeras (5.8), "
-        "frobenius (5.9), trivedi (5.11) or polynomial (5.25)",
+        "huang-faugeras", description="constraint of the thesis's least squares: (5.8), (5.9), (5.11) or (5.25)"
     )
     lens: bool = Field(True, description="estimate the radial distortion of the lens")
-    file: str = Field(
-        "",
-        description="calibration file or folder of COLMAP, OpenCV, OpenSfM or sfm-app with known cameras; none where "
-        "empty",
-    )
-    keep: bool = Field(
-        False, description="keep the cameras of the calibration file as they are, instead of refining them"
-    )
-    priors: str = Field(
-        "auto",
-        description="name of the method that estimates the camera of each photo from its content (see `sfm-app "
-        "plugins`): evidence that pairs weigh; auto: an installed one; none: only EXIF",
-    )
-    deviation: float = Field(
-        0.0,
-        ge=0,
-        le=1,
-        description="standard deviation of the focals of the calibration file, as a share of them: its cameras are "
-        "then evidence that the photos weigh; 0: its cameras are used",
-    )
-    center_sigma: float = Field(
-        0.15,
-        gt=0,
-        le=10,
-        description="soft prior: standard deviation of the optical center about the middle, in image widths",
-    )
+    file: str = Field("", description="file or folder of known cameras, as of COLMAP or OpenCV; none where empty")
+    keep: bool = Field(False, description="keep the cameras of the calibration file as they are")
+    priors: str = Field("auto", description="guesses cameras from photos; auto: an installed one; none: only EXIF")
+    deviation: float = Field(0.0, ge=0, le=1, description="deviation of the file's focals (a share); 0: exact")
+    center_sigma: float = Field(0.15, gt=0, le=10, description="deviation of the center from the middle, in widths")
 
 
 HypothesisName = Literal[
@@ -173,31 +130,19 @@ class SceneSettings(Section):
     """Poses, sparse points and bundle adjustment."""
 
     mapper: Literal["auto", "incremental", "global"] = Field(
-        "auto", description="incremental: photo after photo from a seed; global: all at once; auto: the better of both"
+        "auto", description="incremental: photo after photo; global: all at once; auto: the better of both"
     )
     camera_model: CameraModelName = Field(
-        "auto",
-        description="COLMAP's camera model that the last adjustment ends with, such as OPENCV or OPENCV_FISHEYE; auto: "
-        "the model with the best support of the photos",
+        "auto", description="COLMAP's camera model of the last adjustment, such as OPENCV; auto: by the photos"
     )
     max_init_pairs: int = Field(5, ge=1, le=100, description="most seed pairs that are tried")
-    min_seed_angle_deg: float = Field(
-        2.0, gt=0, le=90, description="least median triangulation angle of a seed pair, in degrees"
-    )
+    min_seed_angle_deg: float = Field(2.0, gt=0, le=90, description="least median angle of seeds, in degrees")
     part_photos: int = Field(
-        0,
-        ge=0,
-        le=100_000,
-        description="photos of a part, where more than half as many again are mapped in parts that are joined "
-        "afterwards; 0: parts of 150 for more than 400 photos",
+        0, ge=0, le=100_000, description="photos of a part, of larger sets: these are mapped in parts; 0: 150 above 400"
     )
     min_points: int = Field(30, ge=6, le=10000, description="a model with fewer points counts as failed")
     without: tuple[HypothesisName, ...] = Field((), description="hypotheses about the photos that are not tried")
-    hypotheses_s: float = Field(
-        3600.0,
-        ge=0,
-        description="time for hypotheses about the photos, in seconds; the report names those that had none left",
-    )
+    hypotheses_s: float = Field(3600.0, ge=0, description="time for hypotheses, in seconds")
     photo_rotation_deg: Literal["auto", 0, 90, 180, 270] = Field(
         "auto", description="clockwise rotation that makes most photos upright, in degrees"
     )
@@ -209,7 +154,7 @@ class SceneSettings(Section):
     @field_validator("without", mode="before")
     @classmethod
     def split_names(cls, names: object) -> object:
-        """Return the names of a text, which commas separate, as a list."""
+        """Split a text at its commas."""
         return [name.strip() for name in names.split(",") if name.strip()] if isinstance(names, str) else names
 
 
@@ -217,17 +162,11 @@ class ScaleSettings(Section):
     """Real size: known lengths and places in the scene. Poses and depth do not depend on it."""
 
     distances: tuple[tuple[str, str, str], ...] = Field(
-        (),
-        description='known distances, each ["x,y,z", "x,y,z", "1.25m"]: two points in the unit of OUT/sparse, and '
-        "their distance; measure in the report prints them",
+        (), description='known distances, each ["x,y,z", "x,y,z", "1.25m"]; measure in the report prints points'
     )
-    markers: str = Field(
-        "", description="side of the dark square of printed ArUco or AprilTag markers, such as 50mm; none where empty"
-    )
+    markers: str = Field("", description="side of the dark square of printed markers, such as 50mm; none where empty")
     marker_family: MarkerFamily = Field("auto", description="family of these markers; auto: the common ones")
-    control_points: str = Field(
-        "", description="file with ground control points, as OpenDroneMap's gcp_list.txt; none where empty"
-    )
+    control_points: str = Field("", description="file of ground control points, as OpenDroneMap's gcp_list.txt")
 
     @field_validator("markers")
     @classmethod
@@ -251,90 +190,52 @@ class ScaleSettings(Section):
 class DepthSettings(Section):
     """Depth maps."""
 
-    method: str = Field(
-        "auto",
-        description="name of the method (see `sfm-app plugins`); auto: on the GPU where one can be used, else cpu",
-    )
+    method: str = Field("auto", description="see `sfm-app plugins`; auto: on the GPU if possible, else cpu")
     max_image_size_px: int = Field(1000, ge=64, le=16384, description="longer side of the depth maps, in pixels")
     levels: int = Field(
         AS_NEEDED,
         ge=AS_NEEDED,
         le=MOST_LEVELS,
-        description="sizes of depth maps, each half of the one before: smaller ones find more of plain walls, "
-        "furniture and floors, and plain areas between known surfaces get their plane; 0: a second one where the first "
-        "leaves much open",
+        description="sizes of depth maps: smaller ones find more of plain walls; 0: 2 where needed",
     )
     neighbors: int = Field(4, ge=1, le=20, description="photos to match with each one")
-    consistency: float = Field(
-        0.01, gt=0, le=1, description="largest relative depth difference between photos that agree"
-    )
+    consistency: float = Field(0.01, gt=0, le=1, description="largest relative difference of depths that agree")
     min_agreeing: int = Field(1, ge=1, le=20, description="other photos that have to agree with a depth")
-    drop_sky: bool = Field(
-        True, description="remove depths in bright, even areas that other photos show to be infinitely far; false: keep"
-    )
+    drop_sky: bool = Field(True, description="remove depths in bright, even areas that are infinitely far; false: keep")
 
 
 class MeshSettings(Section):
     """The surface through the depth maps."""
 
     watertight: bool = Field(False, description="close the surface where no photo sees it, by a guess, for printing")
-    min_island: float = Field(
-        0.003, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped"
-    )
-    max_error_edges: float = Field(
-        0.15, ge=0, le=10, description="most that simplification may move the surface, in edges of its triangles"
-    )
+    min_island: float = Field(0.003, ge=0, le=1, description="parts with a smaller share of the triangles are dropped")
+    max_error_edges: float = Field(0.15, ge=0, le=10, description="most that simplification moves it, in edges")
     max_image_size_px: int = Field(
         1600,
         ge=0,
         le=16384,
-        description="longer side of the photos that refine the surface, in pixels: it moves to where they agree best; "
-        "0: no refinement",
+        description="longer side of the photos that refine the surface, in pixels; 0: no refinement",
     )
-    faces: int = Field(
-        200_000, ge=100, le=50_000_000, description="most triangles of the finished mesh, or of each of its blocks"
-    )
-    block_points: int = Field(
-        4_000_000,
-        ge=1000,
-        le=1_000_000_000,
-        description="most points of depth maps in one mesh; more are meshed in blocks of half as many",
-    )
+    faces: int = Field(200_000, ge=100, le=50_000_000, description="most triangles of the mesh or of a block")
+    block_points: int = Field(4_000_000, ge=1000, le=1_000_000_000, description="most points in one mesh")
 
 
 class TextureSettings(Section):
     """The texture of the surface."""
 
     max_atlas_px: int = Field(4096, ge=256, le=16384, description="longest side of a page of texture, in pixels")
-    max_pages: int = Field(
-        4, ge=1, le=64, description="most pages of texture for each 400 000 triangles; more detail is scaled down"
-    )
+    max_pages: int = Field(4, ge=1, le=64, description="most pages for each 400 000 triangles")
     unseen_faces: Literal["color", "cut"] = Field(
-        "color", description="triangles that no photo sees: color: painted like their surroundings; cut: removed"
+        "color", description="triangles that no photo sees: color: as their surroundings; cut: removed"
     )
-    trim_borders: bool = Field(
-        True,
-        description="remove borders of the surface where photos disagree about the color: they show the background; "
-        "false, or where `mesh.watertight` is true: keep them",
-    )
-    normal_map: bool = Field(
-        False,
-        description="keep the detail that simplification removes as a normal map, visible under light; false: none, "
-        "shown unlit",
-    )
+    normal_map: bool = Field(False, description="keep the detail that simplification removes as a normal map")
 
 
 class ClusterSettings(Section):
     """Dask's workers, on this machine or on others; results do not depend on them."""
 
-    address: str = Field(
-        "",
-        description="scheduler HOST:PORT of a Dask cluster, or local:N for N processes of this machine; none where "
-        "empty",
-    )
-    wait_s: float = Field(
-        60.0, gt=0, le=86400, description="seconds to wait for the scheduler, and for workers where it has none"
-    )
+    address: str = Field("", description="scheduler HOST:PORT of Dask, or local:N for N processes here; none if empty")
+    wait_s: float = Field(60.0, gt=0, le=86400, description="seconds to wait for the scheduler and its workers")
 
     @field_validator("address")
     @classmethod
@@ -387,9 +288,7 @@ class Settings(Section):
     seed: int = Field(0, ge=0, lt=2**32, description="same seed, same result")
     workers: int = Field(0, ge=0, le=1024, description="parallel workers; 0: one per core")
     quality: Quality = Field("normal", description="preset for image sizes and mesh resolution")
-    max_memory_gb: float = Field(
-        0.0, ge=0, le=4096, description="memory limit in GB; 0: four fifths of the memory of the machine"
-    )
+    max_memory_gb: float = Field(0.0, ge=0, le=4096, description="memory limit in GB; 0: four fifths of the machine's")
     plugins: bool = Field(True, description="load installed plug-ins; false: only the program's own methods")
     report: bool = Field(True, description="write OUT/report.html at the end of every run; false: do not")
     photos: PhotoSettings = PhotoSettings()

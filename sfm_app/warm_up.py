@@ -11,23 +11,19 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.api import reconstruct
 from sfm_app.jit import PARENT, WARM
 from sfm_app.operating_system import end_own_group, watch_parent, yield_to_others
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import look_at
+from sfm_app.types.arrays import ByteArray
 
 WIDTH, HEIGHT, FOCAL = 480, 360, 520.0
 """Size and focal length of the photos in pixels: small, and mapped with certainty. Chosen by hand."""
 SIDE = 640
 """Side of the pictures on the walls, in pixels."""
-SETTINGS = {
-    "report": False,
-    "matching": {"enlarge_below": 0, "max_features": 2000},
-    "depth": {"max_image_size_px": 240},
-}
+QUICK = {"report": False, "matching": {"enlarge_below": 0, "max_features": 2000}, "depth": {"max_image_size_px": 240}}
 """Settings that save time and need the same kernels."""
 
 
@@ -51,7 +47,7 @@ def write_photos(folder: Path) -> None:
         cv2.imwrite(str(folder / f"{number}.png"), photo)
 
 
-def _noise(rng: np.random.Generator) -> NDArray[np.uint8]:
+def _noise(rng: np.random.Generator) -> ByteArray:
     """Return a picture (SIDE, SIDE, 3) with details of many sizes."""
     layers = [
         cv2.resize(rng.normal(size=(n, n, 3)), (SIDE, SIDE), interpolation=cv2.INTER_CUBIC) for n in (10, 40, 160)
@@ -73,7 +69,7 @@ def main() -> None:
     os.environ[PARENT] = str(os.getpid())
     try:
         write_photos(folder / "photos")
-        reconstruct(folder / "photos", folder / "model", Settings.from_mapping(SETTINGS))
+        reconstruct(folder / "photos", folder / "model", Settings.from_mapping(QUICK))
     finally:
         WARM.parent.mkdir(parents=True, exist_ok=True)
         WARM.touch()

@@ -20,10 +20,7 @@ LENGTH = re.compile(r"\s*([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*([a-zA-Z'\"]*)\s*")
 
 
 def parse_length(text: str) -> float:
-    """Return a length such as 1.25m, 50 mm or 3ft in meters.
-
-    Raise a ValueError if it is no positive length. A bare number is refused: 50 may mean millimeters.
-    """
+    """Return a length such as 1.25m, 50 mm or 3ft in meters; ValueError for others, and without a unit."""
     match = LENGTH.fullmatch(text)
     unit = match.group(2).lower() if match else ""
     if match is None or unit not in METERS:

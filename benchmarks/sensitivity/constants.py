@@ -29,7 +29,7 @@ class Constant:
     path: str
     """Of the module, below the project's root."""
     names: str
-    """As they are assigned, joined by commas; a field is `LoopOptions.name`."""
+    """As they are assigned, joined by commas; a field is `OPTIONS.name`."""
 
     @property
     def module(self) -> str:
@@ -48,7 +48,7 @@ def constants(rooms: Sequence[str] = ROOMS, root: Path = ROOT) -> list[Constant]
 
 
 def assignments(tree: ast.Module | ast.ClassDef) -> Iterator[tuple[str, ast.Assign | ast.AnnAssign, str]]:
-    """Yield names, statement and docstring of the constants of a module, with the fields of its `*Options` classes.
+    """Yield names, statement and docstring of the constants of a module, with the fields of its classes of constants.
 
     The docstring of a field is followed by that of its class.
     """
@@ -59,7 +59,7 @@ def assignments(tree: ast.Module | ast.ClassDef) -> Iterator[tuple[str, ast.Assi
             text = after.value if isinstance(after, ast.Expr) else None
             about = str(text.value) if isinstance(text, ast.Constant) else ""
             yield ", ".join(names), statement, " ".join(about.split())
-        elif isinstance(statement, ast.ClassDef) and statement.name.endswith("Options"):
+        elif isinstance(statement, ast.ClassDef) and (statement.name.isupper() or statement.name.endswith("Options")):
             whole = " ".join((ast.get_docstring(statement) or "").split())
             for name, field, about in assignments(statement):
                 yield f"{statement.name}.{name}", field, f"{about} {whole}".strip()

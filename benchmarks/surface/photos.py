@@ -31,7 +31,10 @@ class PlacedPhoto:
     center: FloatArray
     """(3,) center of the camera."""
     rays: FloatArray
-    """(H, W, 3) directions in the world that the pixels see."""
+    """(H, W, 3) directions in the world that the pixels see; their depth is 1."""
+    camera: "pycolmap.Camera"
+    cam_from_world: FloatArray
+    """(3, 4)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,16 +57,20 @@ def placed_photos(out: Path) -> dict[str, "pycolmap.Image"]:
     return {image.name: image for image in sorted(model.images.values(), key=lambda i: i.name) if image.has_pose}
 
 
-def placed_photo(out: Path, name: str) -> PlacedPhoto:
-    """Read one registered photo with its pixels and rays."""
+def placed_photo(out: Path, name: str, widest: int | None = None) -> PlacedPhoto:
+    """Read one registered photo with its pixels and rays, reduced to `widest` pixels of width."""
     model = pycolmap.Reconstruction(out / "sparse")
     image = next(image for image in model.images.values() if image.name == name)
     camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
-    pixels = np.asarray(Image.open(out / "photos" / name).convert("RGB"))
+    picture = Image.open(out / "photos" / name).convert("RGB")
+    if widest and camera.width > widest:
+        camera.rescale(widest, round(camera.height * widest / camera.width))
+        picture = picture.resize((camera.width, camera.height), Image.Resampling.BOX)
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     plane = np.asarray(camera.cam_from_img(np.column_stack([x.ravel(), y.ravel()])), np.float64).reshape(-1, 2)
     rays = np.column_stack([plane, np.ones(len(plane))]) @ pose[:, :3]
-    return PlacedPhoto(name, pixels, -pose[:, :3].T @ pose[:, 3], rays.reshape(camera.height, camera.width, 3))
+    rays = rays.reshape(camera.height, camera.width, 3)
+    return PlacedPhoto(name, np.asarray(picture), -pose[:, :3].T @ pose[:, 3], rays, camera, pose)
 
 
 def render_view(model: PreparedModel, photo: PlacedPhoto) -> Picture:

@@ -10,16 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sfm_app.bundle.lens_parts import (
-    COUNT,
-    FOCAL_SPREAD,
-    LOG_FOCAL,
-    PARTS,
-    LensPriors,
-    model_name,
-    part_names,
-    step_cameras,
-)
+from sfm_app.bundle import lens_parts
 from sfm_app.bundle.normal_equations import ReducedSystem
 from sfm_app.camera.projection import angle_limit, radius_at
 from sfm_app.camera.rows import CAMERA, CX, CY, FISHEYE, FX, FY, K1, K2, K3, K4, PANORAMA, PERSPECTIVE
@@ -36,8 +27,7 @@ neighboring observations are correlated. Chosen on photo sets with known cameras
 (docs/algorithms/bundle-adjustment.md)."""
 
 
-@dataclass(frozen=True, slots=True)
-class LensOptions:
+class OPTIONS:
     """Limits of the estimate and of the choice of a family."""
 
     undetermined_share: float = 0.5
@@ -64,9 +54,6 @@ class LensOptions:
     """Radii at which a lens is fitted to another. Chosen by hand."""
     least_reach: float = 0.2
     """Smallest share of the observed radius up to which a lens must not fold to be tried as another. Chosen by hand."""
-
-
-OPTIONS = LensOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +91,7 @@ class LensEstimate:
     """(C,) cameras with a more probable lens that folds inside the photo, and was refused."""
 
 
-def estimate_lenses(params: FloatArray, reduced: ReducedSystem, priors: LensPriors) -> LensEstimate:
+def estimate_lenses(params: FloatArray, reduced: ReducedSystem, priors: lens_parts.LensPriors) -> LensEstimate:
     """Return the most probable cameras under the most probable choice of freed parts; undetermined parts stay.
 
     Deviations are root mean squares about these cameras, over all choices of freed parts. They are at least those of
@@ -130,7 +117,9 @@ def estimate_lenses(params: FloatArray, reduced: ReducedSystem, priors: LensPrio
     return replace(estimate, params=clamped, ranking=ranking, folding=barred)
 
 
-def _weigh(params: FloatArray, reduced: ReducedSystem, priors: LensPriors) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _weigh(
+    params: FloatArray, reduced: ReducedSystem, priors: lens_parts.LensPriors
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return H (12C, 12C) and g (12C,) by log focal and log aspect, and the offsets of the priors (C, 12)."""
     T, weight = _logarithm_jacobian(params), evidence_weight(reduced.noise_px)
     return weight * (T.T @ (reduced.H @ T)), weight * (T.T @ reduced.g), priors.prior_offsets(params)
@@ -141,7 +130,9 @@ def evidence_weight(noise_px: float) -> float:
     return 1.0 / (MISFIT * noise_px) ** 2
 
 
-def _estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors, free: BoolArray) -> LensEstimate:
+def _estimate(
+    params: FloatArray, reduced: ReducedSystem, priors: lens_parts.LensPriors, free: BoolArray
+) -> LensEstimate:
     """Return the most probable cameras for a choice of freed parts (C, 8), without a ranking."""
     H, g, offsets = _weigh(params, reduced, priors)
     T = _logarithm_jacobian(params)
@@ -166,8 +157,8 @@ def _estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors, fr
     moved, held = _apply_step(params, step.reshape(params.shape), priors.sides)
     moved[zero] = priors.usual[zero]
     moved[priors.fixed], held[priors.fixed], deviations[priors.fixed] = params[priors.fixed], False, 0.0
-    prior = priors.precision(np.ones((len(params), COUNT), np.bool_)) ** -0.5
-    prior[:, [FX, FY]] = FOCAL_SPREAD * params[:, [FX, FY]]
+    prior = priors.precision(np.ones((len(params), lens_parts.COUNT), np.bool_)) ** -0.5
+    prior[:, [FX, FY]] = lens_parts.FOCAL_SPREAD * params[:, [FX, FY]]
     undetermined = priors.parameter_mask(priors.estimated) & ~changing
     deviations[held] = np.maximum(deviations[held], prior[held])
     # photos make no part less certain than its prior: a larger deviation is rounding, where nearly all of H cancels
@@ -193,24 +184,24 @@ def _posterior(
     return step, covariance
 
 
-def _find_determined(covariance: FloatArray, precision: FloatArray, priors: LensPriors) -> BoolArray:
+def _find_determined(covariance: FloatArray, precision: FloatArray, priors: lens_parts.LensPriors) -> BoolArray:
     narrower = np.sqrt(np.diag(covariance)).reshape(precision.shape) < OPTIONS.undetermined_share * precision**-0.5
     rows = [
-        [row[list(part.places)].all() for part in PARTS[int(kind)]]
+        [row[list(part.places)].all() for part in lens_parts.PARTS[int(kind)]]
         for row, kind in zip(narrower, priors.family, strict=True)
     ]
-    return np.array(rows, np.bool_).reshape(-1, COUNT)
+    return np.array(rows, np.bool_).reshape(-1, lens_parts.COUNT)
 
 
 def _choose(
-    H: FloatArray, g: FloatArray, offsets: FloatArray, priors: LensPriors
+    H: FloatArray, g: FloatArray, offsets: FloatArray, priors: lens_parts.LensPriors
 ) -> tuple[BoolArray, tuple[tuple[LensChoice, ...], ...]]:
     """Return the most probable choice (C, 8), and the ranking of `LensEstimate`.
 
     One sweep asks all cameras, with the choices for the others from before the sweep. Asking one after the other, as
     `selfcal.priors` does, takes a posterior of all cameras for each, which is too slow for hundreds.
     """
-    free, everything = np.zeros((len(offsets), COUNT), np.bool_), np.ones_like(offsets, np.bool_)
+    free, everything = np.zeros((len(offsets), lens_parts.COUNT), np.bool_), np.ones_like(offsets, np.bool_)
     ranking: list[tuple[LensChoice, ...]] = []
     for _ in range(OPTIONS.sweeps):
         before, precision, ranking = free, priors.precision(free), []
@@ -230,15 +221,15 @@ def _choose(
 def _rank(family: int, choices: BoolArray, log_evidence: FloatArray) -> tuple[LensChoice, ...]:
     best: dict[str, LensChoice] = {}
     for k in np.argsort(-log_evidence, kind="stable"):
-        free = part_names(family, choices[k])
-        name = model_name(family, free)
+        free = lens_parts.part_names(family, choices[k])
+        name = lens_parts.model_name(family, free)
         best.setdefault(name, LensChoice(name, free, float(log_evidence[k])))
     return tuple(best.values())
 
 
 def _mean_squares(
     step: FloatArray, posterior: tuple[FloatArray, FloatArray], precision: FloatArray, offsets: FloatArray,
-    priors: LensPriors,
+    priors: lens_parts.LensPriors,
 ) -> FloatArray:  # fmt: skip
     """Return (12C, 12C) mean squares of the cameras about a step, over all choices for each, the others as they are.
 
@@ -274,14 +265,14 @@ def _multiply(A: FloatArray, B: FloatArray) -> FloatArray:
 def _apply_step(params: FloatArray, step: FloatArray, sides: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return the cameras (C, 12) after a step, and (C,) those that it makes diverge."""
     with np.errstate(over="ignore", invalid="ignore"):
-        moved = step_cameras(params, step)
+        moved = lens_parts.step_cameras(params, step)
         focals = moved[:, [FX, FY]] / sides[:, None]
     low, high = OPTIONS.focals
     is_plausible = np.isfinite(moved).all(axis=1) & np.all((focals > low) & (focals < high), axis=1)
-    return moved, ~is_plausible | (np.abs(step[:, LOG_FOCAL]) > OPTIONS.longest_step)
+    return moved, ~is_plausible | (np.abs(step[:, lens_parts.LOG_FOCAL]) > OPTIONS.longest_step)
 
 
-def _shorten_step(before: FloatArray, after: FloatArray, camera: int, priors: LensPriors) -> FloatArray:
+def _shorten_step(before: FloatArray, after: FloatArray, camera: int, priors: lens_parts.LensPriors) -> FloatArray:
     """Return a camera (12,) between two that does not fold; the second where the first folds, too."""
     if priors.folds(camera, before):
         return after
@@ -330,8 +321,5 @@ def convert_lens(params: FloatArray, family: int, reach: float) -> FloatArray | 
 
 
 def family_evidence(cost_px2: float, noise_px: float, best: LensChoice) -> float:
-    """Return the log-probability of a bundle with one of its cameras as it is, comparable between families.
-
-    The noise is the same for all candidates.
-    """
+    """Return the log-probability of a bundle with one of its cameras as it is, comparable between families."""
     return best.log_evidence - evidence_weight(noise_px) * cost_px2

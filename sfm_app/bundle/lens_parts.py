@@ -9,22 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_app.camera.models import (
-    ASPECT,
-    CENTER,
-    FAMILIES,
-    FOCAL,
-    FREE_SHARE,
-    LENS,
-    NARROW,
-    PARAMETERS,
-    TERMS,
-    TWO_FOCALS,
-    WIDE,
-    camera_matrix,
-    projection_of_model,
-    row_of_calibration,
-)
+from sfm_app.camera import models
 from sfm_app.camera.projection import SEEN_ANGLE, angle_limit
 from sfm_app.camera.rows import (
     CAMERA,
@@ -81,13 +66,22 @@ class Part:
     """Whether it is exactly at its usual value, 0, unless it is freed."""
 
 
-_CENTER = Part("center", (CX, CY), NARROW[CENTER], WIDE[CENTER], FREE_SHARE[CENTER], True)
-_ASPECT = Part("aspect", (LOG_ASPECT,), NARROW[ASPECT], WIDE[ASPECT], FREE_SHARE[ASPECT], True)
-_FOCAL = Part("focal", (LOG_FOCAL,), FOCAL_SPREAD, FOCAL_SPREAD, FREE_SHARE[FOCAL])
+_CENTER = Part(
+    "center", (CX, CY), models.NARROW[models.CENTER], models.WIDE[models.CENTER], models.FREE_SHARE[models.CENTER], True
+)
+_ASPECT = Part(
+    "aspect",
+    (LOG_ASPECT,),
+    models.NARROW[models.ASPECT],
+    models.WIDE[models.ASPECT],
+    models.FREE_SHARE[models.ASPECT],
+    True,
+)
+_FOCAL = Part("focal", (LOG_FOCAL,), FOCAL_SPREAD, FOCAL_SPREAD, models.FREE_SHARE[models.FOCAL])
 PERSPECTIVE_PARTS = (
     _CENTER,
     _ASPECT,
-    Part("k1", (K1,), NARROW[LENS], WIDE[LENS], FREE_SHARE[LENS]),
+    Part("k1", (K1,), models.NARROW[models.LENS], models.WIDE[models.LENS], models.FREE_SHARE[models.LENS]),
     Part("k2", (K2,), 0.01, 0.2, 0.3),
     Part("p1 p2", (P1, P2), 0.0002, 0.002, 0.05, True),
     Part("k3", (K3,), ABSENT, 0.03, 0.1, powers=(6,), needs=("k1", "k2"), exact=True),
@@ -298,7 +292,7 @@ def step_cameras(params: FloatArray, step: FloatArray) -> FloatArray:
     return result
 
 
-PROJECTIONS = {family: projection for projection, family in FAMILIES.items()}
+PROJECTIONS = {family: projection for projection, family in models.FAMILIES.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -321,14 +315,14 @@ class CameraRule:
     def family(self) -> int | None:
         """Required family; None where the photos choose."""
         if self.given is not None and self.is_kept:
-            return FAMILIES[self.given.projection]
-        return FAMILIES[projection_of_model(self.model)] if self.model else None
+            return models.FAMILIES[self.given.projection]
+        return models.FAMILIES[models.projection_of_model(self.model)] if self.model else None
 
     def usual(self, family: int) -> FloatArray | None:
         """Return the user's parameters (12,); None if they are not of this family."""
-        if self.given is None or FAMILIES[self.given.projection] != family:
+        if self.given is None or models.FAMILIES[self.given.projection] != family:
             return None
-        return row_of_calibration(self.given)
+        return models.row_of_calibration(self.given)
 
     def write_values(self, family: int, usual: FloatArray, claims: FloatArray) -> None:
         """Write the user's or the claimed parameters (12,) over usual ones, and deviations of claims over `claims`."""
@@ -346,8 +340,8 @@ class CameraRule:
         """Return (8,) the parts of the model besides focal and center; None if it is open, or not of this family."""
         if not self.model or self.family != family or family == PANORAMA:
             return None
-        names = (*TWO_FOCALS, *TERMS[PROJECTIONS[family]])
-        has = set(PARAMETERS[self.model])
+        names = (*models.TWO_FOCALS, *models.TERMS[PROJECTIONS[family]])
+        has = set(models.PARAMETERS[self.model])
         rows = [
             part not in (_FOCAL, _CENTER) and has.issuperset(names[k] for k in part.places) for part in PARTS[family]
         ]
@@ -364,7 +358,7 @@ def calibration_from_params(
 
     The camera is no panorama; `determined` names the parts that the photos determine.
     """
-    K = camera_matrix(*(float(params[k]) for k in (FX, FY, CX, CY)))
+    K = models.camera_matrix(*(float(params[k]) for k in (FX, FY, CX, CY)))
     spread = {name: float(deviations[k]) for name, k in (("fx", FX), ("fy", FY), ("cx", CX), ("cy", CY), ("k1", K1))}
     spread = {name: value for name, value in spread.items() if np.isfinite(value)}
     held = tuple(name for name in ("center", "aspect", "k1") if name not in determined)

@@ -10,12 +10,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.projection import image_points, project_points, wrap_residuals
 from sfm_app.camera.rows import CAMERA, PANORAMA
 from sfm_app.geometry.least_squares import project_to_psd, solve_positive, solve_sparse_positive
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -27,8 +26,7 @@ BLOCK = 6
 """Unknowns of a block of sparse matrices: a pose, or half of a camera."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReductionOptions:
+class REDUCTION:
     """Limits of the reduction (docs/algorithms/bundle-adjustment.md)."""
 
     min_information: float = 1e-11
@@ -48,10 +46,7 @@ class ReductionOptions:
     """Derivative above which an observation is lost. Chosen by hand."""
 
 
-REDUCTION = ReductionOptions()
-
-
-def whiten_points(by_point: FloatArray, point: NDArray[np.int64], points: int) -> tuple[FloatArray, NDArray[np.int64]]:
+def whiten_points(by_point: FloatArray, point: IndexArray, points: int) -> tuple[FloatArray, IndexArray]:
     """Return W (P, 3, 3) that makes derivatives by W^-T X orthonormal over the observations of a point, and its rank.
 
     Along undetermined directions, W is 0. The derivatives (N, 2, 3) are weighted; `point` has their rows (N,).
@@ -69,7 +64,7 @@ def whiten_points(by_point: FloatArray, point: NDArray[np.int64], points: int) -
     return gains[:, :, None] * vectors.transpose(0, 2, 1) / scale[:, None, :], np.count_nonzero(determined, axis=1)
 
 
-def free_pose_columns(R: FloatArray, t: FloatArray) -> NDArray[np.int64]:
+def free_pose_columns(R: FloatArray, t: FloatArray) -> IndexArray:
     """Return the free pose columns when the gauge is fixed: the first photo, and one coordinate of the farthest one."""
     centers = -np.einsum("nji,nj->ni", R, t)
     far = int(np.argmax(np.linalg.norm(centers - centers[0], axis=1)))
@@ -78,7 +73,7 @@ def free_pose_columns(R: FloatArray, t: FloatArray) -> NDArray[np.int64]:
     return np.array([k for k in range(POSE * len(R)) if k not in held], np.int64)
 
 
-def elimination_width(photo: NDArray[np.int64], point: NDArray[np.int64]) -> float:
+def elimination_width(photo: IndexArray, point: IndexArray) -> float:
     """Return the root mean square width, in photos, of the envelope of the poses' normal equations.
 
     Photos that share a point are tied. In a street few are, wherever it leads; in a room all are. A factorization costs
@@ -107,21 +102,21 @@ class Bundle:
 
     params: FloatArray
     """(C, 12) parameters as in `camera.projection`: fx, fy, cx, cy in pixels, k1, k2, p1, p2, ..."""
-    camera: NDArray[np.int64]
+    camera: IndexArray
     """(I,) row of the camera of each photo."""
     R: FloatArray
     t: FloatArray
     """(I, 3, 3) rotations and (I, 3) translations, camera from world."""
     X: FloatArray
     """(P, 3) points."""
-    photo: NDArray[np.int64]
-    point: NDArray[np.int64]
+    photo: IndexArray
+    point: IndexArray
     """(N,) rows of the photo and the point of each observation."""
     x: FloatArray
     """(N, 2) observed positions, in pixels."""
-    family: NDArray[np.int64]
+    family: IndexArray
     """(C,) PERSPECTIVE, FISHEYE or PANORAMA of `camera.projection`."""
-    fixed: NDArray[np.bool_] | None = None
+    fixed: BoolArray | None = None
     """(C,) cameras that keep their parameters; None where all may change."""
 
 
@@ -349,14 +344,14 @@ def cost(bundle: Bundle, scale_px: float) -> float:
     return loss(r, usable_mask(bundle, r), scale_px)
 
 
-def loss(r: FloatArray, usable: NDArray[np.bool_], scale_px: float) -> float:
+def loss(r: FloatArray, usable: BoolArray, scale_px: float) -> float:
     """Return half the sum of the loss of `reduce` over residuals (N, 2) in px^2; lost ones count `lost_px`."""
     with np.errstate(all="ignore"):
         squares = np.where(usable, np.einsum("ni,ni->n", r, r), REDUCTION.lost_px**2)
     return float(0.5 * scale_px**2 * np.sum(np.log1p(squares / scale_px**2)))
 
 
-def loss_scale(r: FloatArray, usable: NDArray[np.bool_]) -> float:
+def loss_scale(r: FloatArray, usable: BoolArray) -> float:
     """Return the scale of the loss in pixels from the median of residuals (N, 2): outliers do not change it.
 
     With normal noise, Cauchy's loss is then 95 % efficient (Holland and Welsch 1977).
@@ -369,7 +364,7 @@ def loss_scale(r: FloatArray, usable: NDArray[np.bool_]) -> float:
     )
 
 
-def usable_mask(bundle: Bundle, r: FloatArray, depth: FloatArray | None = None) -> NDArray[np.bool_]:
+def usable_mask(bundle: Bundle, r: FloatArray, depth: FloatArray | None = None) -> BoolArray:
     """Return the mask (N,) of observations of points in front of their camera, with residuals below `lost_px`.
 
     A panorama also sees points behind it. Without depths (N,) before the cameras, they come from the poses.
@@ -381,14 +376,14 @@ def usable_mask(bundle: Bundle, r: FloatArray, depth: FloatArray | None = None) 
         return np.asarray(ahead & (np.abs(r) < REDUCTION.lost_px).all(axis=1), np.bool_)
 
 
-def lost_points(bundle: Bundle) -> NDArray[np.bool_]:
+def lost_points(bundle: Bundle) -> BoolArray:
     """Return the mask (P,) of points with a lost observation."""
     return np.bincount(bundle.point[~usable_mask(bundle, residuals(bundle))], minlength=len(bundle.X)) > 0
 
 
 def weigh(
-    r: FloatArray, by_view: FloatArray, by_point: FloatArray, usable: NDArray[np.bool_], scale_px: float
-) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    r: FloatArray, by_view: FloatArray, by_point: FloatArray, usable: BoolArray, scale_px: float
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
     """Return weighted residuals (N, 2), derivatives (N, 2, k) and (N, 2, 3), and the mask (N,) of used ones, else 0."""
     with np.errstate(all="ignore"):
         largest = np.maximum(np.abs(by_view).max(axis=(1, 2), initial=0.0), np.abs(by_point).max(axis=(1, 2)))

@@ -11,7 +11,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.bundle.lens_evidence import MISFIT
 from sfm_app.bundle.lens_parts import LOG_ASPECT, LOG_FOCAL, LensPriors, step_cameras
@@ -32,7 +31,7 @@ from sfm_app.camera.projection import project_points
 from sfm_app.camera.rows import CAMERA, FX, FY
 from sfm_app.geometry.least_squares import inverse_of_positive
 from sfm_app.numerical import MAD_TO_SIGMA
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 # Projection of points into photos whose rows are read one after the other. Ours; to first order in the motion of
 # the camera, the model is that of Hedborg et al. 2012.
@@ -103,12 +102,12 @@ class PathVelocities:
     errors: FloatArray
     """(F, I, 6) errors of left-out poses, in radians and units of length."""
 
-    def select_most_predictive(self) -> NDArray[np.int64]:
+    def select_most_predictive(self) -> IndexArray:
         """Return the fits (2,) of rotations and of translations that predict left-out poses best."""
         length = np.linalg.norm(self.errors.reshape(*self.errors.shape[:2], 2, 3), axis=3)
         return np.asarray(np.argmin(np.median(length, axis=1), axis=0), np.int64)
 
-    def select(self, fits: NDArray[np.int64]) -> FloatArray:
+    def select(self, fits: IndexArray) -> FloatArray:
         """Return velocities (I, 6), rotations and translations each from their fit (2,)."""
         return np.concatenate([self.values[fits[0], :, :3], self.values[fits[1], :, 3:]], axis=1)
 
@@ -276,7 +275,7 @@ def shutter_cost(model: ShutterBundle, scale_px: float) -> float:
     return loss(*_residuals(model), scale_px)
 
 
-def _residuals(model: ShutterBundle) -> tuple[FloatArray, NDArray[np.bool_]]:
+def _residuals(model: ShutterBundle) -> tuple[FloatArray, BoolArray]:
     """Return observed less predicted positions (N, 2) in pixels, and the mask (N,) of the usable ones."""
     with np.errstate(all="ignore"):
         projected = project_rows(model.bundle, model.share, model.motion)
@@ -284,8 +283,7 @@ def _residuals(model: ShutterBundle) -> tuple[FloatArray, NDArray[np.bool_]]:
     return r, usable_mask(model.bundle, r, projected.depth)
 
 
-@dataclass(frozen=True, slots=True)
-class ReadoutOptions:
+class OPTIONS:
     """Limits of the adjustment of the readout."""
 
     steps: int = 12
@@ -303,9 +301,6 @@ class ReadoutOptions:
     """Number of offsets that the photos must determine before their size changes. Chosen by hand."""
     shake_converged: float = 1.1
     """Factor by which the size of offsets may still change when the steps end. Chosen by hand."""
-
-
-OPTIONS = ReadoutOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -339,7 +334,7 @@ class _Problem:
     """Constants of the adjustment."""
 
     rows: Rows
-    fits: NDArray[np.int64]
+    fits: IndexArray
     """(2,) of turns and moves, see `PathVelocities`."""
     priors: LensPriors
     precision: FloatArray
@@ -349,7 +344,7 @@ class _Problem:
 
 
 def estimate_readout(
-    bundle: Bundle, rows: Rows, priors: LensPriors, freed: NDArray[np.bool_],
+    bundle: Bundle, rows: Rows, priors: LensPriors, freed: BoolArray,
     start: ReadoutEstimate | None = None, *, known: float | None = None,
 ) -> ReadoutEstimate:  # fmt: skip
     """Adjust poses, points, cameras and the readout together; with a known readout, only poses and points.

@@ -53,10 +53,7 @@ SHARES = (0.25, 0.5, 0.75, 1.0)
 
 
 def radius_px(theta: FloatArray, camera: Calibration) -> FloatArray:
-    """Return radii (N,) in pixels of rays at angles (N,) in radians to the axis; NaN where the lens does not show them.
-
-    The curve of a panorama is that along its horizon.
-    """
+    """Return radii (N,) in pixels of rays at angles (N,) in radians to the axis; NaN beyond what the lens shows."""
     if camera.projection == EQUIRECTANGULAR:
         return np.asarray(theta * camera.width / (2.0 * np.pi), np.float64)
     params, family = row_of_calibration(camera), FAMILIES[camera.projection]

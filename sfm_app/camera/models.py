@@ -7,9 +7,9 @@ fisheye of THIN_PRISM_FISHEYE (Kannala and Brandt 2006; Weng et al. 1992).
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera import rows as families
+from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE, GIVEN, PERSPECTIVE, Calibration
 
 GUESSED_FOCAL = 1.2
@@ -26,18 +26,18 @@ FREE_SHARE = {CENTER: 0.3, ASPECT: 0.05, LENS: 0.5, FOCAL: 0.3}
 docs/algorithms/zero-curves.md, 3; by hand."""
 
 
-def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
+def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> FloatArray:
     """Return the (3, 3) camera matrix without skew, in the unit of its arguments."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def guessed_camera_matrix(size: tuple[int, int], focal_px: float | None = None) -> NDArray[np.float64]:
+def guessed_camera_matrix(size: tuple[int, int], focal_px: float | None = None) -> FloatArray:
     """Return the (3, 3) matrix of a camera with square pixels, a central principal point, and a focal or a guess."""
     focal = GUESSED_FOCAL * max(size) if focal_px is None else focal_px
     return camera_matrix(focal, focal, size[0] / 2, size[1] / 2)
 
 
-def panorama_matrix(size: tuple[float, float]) -> NDArray[np.float64]:
+def panorama_matrix(size: tuple[float, float]) -> FloatArray:
     """Return the (3, 3) matrix with the scale of an equirectangular photo at its center, in pixels per radian."""
     return camera_matrix(size[0] / (2.0 * np.pi), size[1] / np.pi, size[0] / 2, size[1] / 2)
 
@@ -88,7 +88,7 @@ def projection_of_model(model: str) -> str:
     return FISHEYE if "FISHEYE" in model else PERSPECTIVE
 
 
-def row_of_model(model: str, params: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
+def row_of_model(model: str, params: Sequence[float] | FloatArray) -> FloatArray:
     """Return a camera with a model and parameters of COLMAP as a row (12,) of `camera.rows`."""
     row = np.zeros(families.CAMERA)
     if model == "EQUIRECTANGULAR":
@@ -98,27 +98,21 @@ def row_of_model(model: str, params: Sequence[float] | NDArray[np.float64]) -> N
     return row
 
 
-def params_of_row(row: NDArray[np.float64], model: str) -> list[float]:
+def params_of_row(row: FloatArray, model: str) -> list[float]:
     """Return the parameters of a model of COLMAP that holds a row (12,) but for its aspect."""
     fx, fy, cx, cy = row[:4]
     values = {"f": (fx * fy) ** 0.5, "w": 2.0 * cx, "h": 2.0 * cy}
     return [float(values[name] if name in values else row[INDEX[name]]) for name in PARAMETERS[model]]
 
 
-def file_model(row: NDArray[np.float64], family: int) -> str:
+def file_model(row: FloatArray, family: int) -> str:
     """Return the smallest of FILE_MODELS that holds a row (12,) of a perspective camera or a fisheye."""
     small, large = FILE_MODELS[family]
     return large if np.delete(row, [INDEX[name] for name in PARAMETERS[small]]).any() else small
 
 
 def calibration_from_model(model: str, params: Sequence[float], size: tuple[int, int]) -> Calibration:
-    """Return the camera with a model and parameters of COLMAP, as given by the user.
-
-    Lengths are in pixels; the size of the photos is (0, 0) where unknown.
-
-    Raises:
-        ValueError: the model is not supported, or the parameters are no camera.
-    """
+    """Return the camera of a model and parameters of COLMAP; size (0, 0) if unknown, ValueError if it is none."""
     names = PARAMETERS.get(model)
     if names is None:
         raise ValueError(f"the camera model {model} is not supported: only {', '.join(PARAMETERS)}")
@@ -135,7 +129,7 @@ def calibration_from_model(model: str, params: Sequence[float], size: tuple[int,
     return Calibration(K, *size, GIVEN, identifiable=True, projection=projection, distortion=terms)
 
 
-def row_of_calibration(camera: Calibration) -> NDArray[np.float64]:
+def row_of_calibration(camera: Calibration) -> FloatArray:
     """Return a camera as a row (12,) of `camera.rows`."""
     panorama = camera.projection == EQUIRECTANGULAR
     K = panorama_matrix((camera.width, camera.height)) if panorama else camera.K

@@ -8,14 +8,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.models import camera_matrix
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import Float32Array, FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class ViewOptions:
+class OPTIONS:
     """Sizes of perspective views."""
 
     most_field_deg: float = 95.0
@@ -24,9 +22,6 @@ class ViewOptions:
     """Angle beyond the view's own part: windows and triangles at the border are whole in one view. Chosen by hand."""
     cube_field_deg: float = 300.0
     """Horizontal field above which a photo is a panorama, with views through the faces of a cube. Chosen by hand."""
-
-
-OPTIONS = ViewOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +35,7 @@ class PerspectiveView:
     width: int
     height: int
 
-    def locate(self, project: Callable[[FloatArray], FloatArray]) -> NDArray[np.float32]:
+    def locate(self, project: Callable[[FloatArray], FloatArray]) -> Float32Array:
         """Return the pixels (height, width, 2) of the photo that the view shows; `project` takes rays (N, 3)."""
         pixels = np.empty((self.height, self.width, 2), np.float32)
         strip = 256  # rows that are projected at once, so that memory stays small
@@ -69,10 +64,7 @@ def cover_rays(rays: FloatArray, focal_px: float, most_px: int) -> list[Perspect
 
 
 def center_view(view: PerspectiveView) -> PerspectiveView:
-    """Return the view turned to the center of its field, with square pixels and the optical center in the middle.
-
-    It is the largest such view of the same aspect inside the given one. At its center, things keep their size.
-    """
+    """Return the view turned to the center of its field, with square pixels and the optical center in the middle."""
     middle = np.linalg.solve(view.K, [view.width / 2, view.height / 2, 1.0])
     length = float(np.linalg.norm(middle))
     x, y, z = middle / length

@@ -384,10 +384,7 @@ def wrap_residuals(r: FloatArray, params: FloatArray, family: IndexArray) -> Flo
 
 
 def image_rays(x: FloatArray, camera: FloatArray, family: int) -> FloatArray:
-    """Return the rays of pixels (N, 2), and their derivatives by x and by y, (N, 9), as in `unproject_point`.
-
-    Pixels beyond the fold of the lens see the rays on it.
-    """
+    """Return the rays of pixels (N, 2), and their derivatives by x and by y, (N, 9), as in `unproject_point`."""
     return _unproject_all(np.ascontiguousarray(x, np.float64), np.ascontiguousarray(camera, np.float64), family)
 
 

@@ -39,6 +39,7 @@ SCENES = {
 STAGES = tuple(STAGE_TITLES)
 MARKER_FAMILIES = tuple(name for name in get_args(setting_field("scale.marker_family").annotation) if name != "auto")
 PAPERS = ("a4", "a3", "letter")
+FORMAT_KINDS = ("exporters", "scene_exporters")
 SHELLS = ("bash", "zsh", "fish")
 GIGABYTE, MB_PER_GB = 2**30, 2**30 / 1e6
 ENOUGH_DISK = 2 * GIGABYTE
@@ -52,12 +53,9 @@ ENOUGH_DISK = 2 * GIGABYTE
     "first",
     type=click.Choice(STAGES),
     metavar="STAGE",
-    default=None,
     help=f"Run this stage and all later ones again: {', '.join(STAGES)}.",
 )
-@click.option(
-    "--until", "last", type=click.Choice(STAGES), metavar="STAGE", default="files", help="Stop after this stage."
-)
+@click.option("--until", "last", type=click.Choice(STAGES), metavar="STAGE", default="files", help="Last stage.")
 @settings_options
 @output_options
 def run(photos: tuple[Path, ...], out: Path | None, first: str | None, last: str, **flags: Any) -> None:
@@ -91,15 +89,13 @@ def _default_folder(photos: Path) -> Path:
 
 
 @click.command()
-@click.argument("photos", type=PATH)
+@click.argument("photos", type=PATH, nargs=-1, required=True)
 @click.option("-o", "--out", type=PATH, help="Keep features and matches in this folder.")
-@click.option(
-    "--figure", type=PATH, help="Plot the pairs' votes, the lens curve and the residuals in this PNG, SVG or PDF file."
-)
+@click.option("--figure", type=PATH, help="Plot votes, lens and residuals in this PNG, SVG or PDF.")
 @settings_options
 @output_options
-def calibrate(photos: Path, out: Path | None, figure: Path | None, **flags: Any) -> None:
-    """Estimate the camera matrix of PHOTOS, a folder or a video, without reconstructing the scene."""
+def calibrate(photos: tuple[Path, ...], out: Path | None, figure: Path | None, **flags: Any) -> None:
+    """Estimate the camera matrix of PHOTOS, named as in `sfm-app run`, without reconstructing the scene."""
     from sfm_app.cli.terminal import Terminal
     from sfm_app.report.text import intrinsics_lines, intrinsics_summary
 
@@ -112,13 +108,7 @@ def calibrate(photos: Path, out: Path | None, figure: Path | None, **flags: Any)
 @click.command()
 @click.argument("side")
 @click.option(
-    "-o",
-    "--output",
-    "target",
-    type=PATH,
-    default=Path("markers.pdf"),
-    show_default=True,
-    help="PDF or SVG file to write.",
+    "-o", "--output", "target", type=PATH, default=Path("markers.pdf"), show_default=True, help="PDF or SVG to write."
 )
 @click.option(
     "--family",
@@ -128,9 +118,7 @@ def calibrate(photos: Path, out: Path | None, figure: Path | None, **flags: Any)
     show_default=True,
     help=f"Marker family: {', '.join(MARKER_FAMILIES)}.",
 )
-@click.option(
-    "--first", type=click.IntRange(0, 10_000), default=0, show_default=True, help="Number of the first marker."
-)
+@click.option("--first", type=click.IntRange(0, 10_000), default=0, show_default=True, help="Number of the first.")
 @click.option("--paper", type=click.Choice(PAPERS), default="a4", show_default=True, help="Size of the page.")
 def markers(side: str, target: Path, family: str, first: int, paper: str) -> None:
     """Make a page of markers to print and to place in the scene; SIDE is their side length, such as 50mm.
@@ -157,9 +145,7 @@ def markers(side: str, target: Path, family: str, first: int, paper: str) -> Non
     show_default=True,
     help="Scene to photograph: " + "; ".join(f"{name}: {text}" for name, text in SCENES.items()) + ".",
 )
-@click.option(
-    "--open/--no-open", "opens", default=None, help="Open the report in the browser.  [default: only on a terminal]"
-)
+@click.option("--open/--no-open", "opens", default=None, help="Open the report.  [default: on a terminal]")
 @settings_options
 @output_options
 def demo(out: Path | None, scene: str, opens: bool | None, **flags: Any) -> None:
@@ -234,7 +220,7 @@ class ExportCommand(click.Command):
     "file_format",
     default="",
     metavar="NAME",
-    shell_complete=complete_methods("exporters", "scene_exporters"),
+    shell_complete=complete_methods(*FORMAT_KINDS),
     help="One of the formats below.  [default: the suffix of the output file]",
 )
 @click.option(
@@ -381,15 +367,7 @@ def plugins() -> None:
     from sfm_app.plugins import load_plugins
 
     methods = load_plugins()
-    for kind in (
-        "features",
-        "camera_priors",
-        "estimators",
-        "calibrators",
-        "exporters",
-        "scene_exporters",
-        "depth_methods",
-    ):
+    for kind in ("features", "camera_priors", "estimators", "calibrators", *FORMAT_KINDS, "depth_methods"):
         rows = table({method.name: method.summary for method in getattr(methods, kind).values()})
         if rows:
             print_text([f"{kind.replace('_', ' ')}:", *(f"  {row}" for row in rows)])

@@ -94,12 +94,7 @@ def settings_options(command: Command) -> Command:
         # scripts for older versions pass it
         click.option("--no-picture", is_flag=True, hidden=True, expose_value=False),
         click.option("--set", "assignments", multiple=True, metavar="TABLE.KEY=VALUE", help="Any other setting."),
-        click.option(
-            "-v",
-            "--verbose",
-            count=True,
-            help="Print all results and COLMAP's warnings; -vv prints all of COLMAP's log.",
-        ),
+        click.option("-v", "--verbose", count=True, help="Print all results and COLMAP's warnings; -vv: its log."),
     )
     return reduce(lambda wrapped, option: option(wrapped), reversed(options), command)
 

@@ -51,7 +51,7 @@ def run_summary(run: Run) -> dict[str, Any]:
         "report": str(run.report_path) if run.report_path else None,
         "seconds": {name: stage["seconds"] for name, stage in stages.items()},
     }
-    optional = {"video": photos.get("video"), "given_cameras": given_cameras}
+    optional = {"video": photos.get("video"), "missing": photos.get("missing"), "given_cameras": given_cameras}
     summary |= {name: value for name, value in optional.items() if value}
     if run.scene:
         points = [str(path) for path in _model_files(run, "scale")]
@@ -86,8 +86,7 @@ def _input_lines(summary: Mapping[str, Any]) -> Iterator[str]:
         yield from _video_lines(summary["video"])
     yield f"photos      {summary['photos']['usable']} usable"
     yield from (f"{INDENT}{line}" for line in _photo_lines(summary["photos"]))
-    if summary["masks"] is not None:
-        yield from _mask_lines(summary["masks"], summary["photos"]["usable"])
+    yield from _mask_lines(summary)
     if summary["pairs"]["kept"] is not None:
         rejected = ", ".join(f"{count} {reason}" for reason, count in summary["pairs"]["rejected"].items())
         yield f"pairs       {summary['pairs']['kept']} verified" + (f"; rejected: {rejected}" if rejected else "")
@@ -101,7 +100,7 @@ def outcome_lines(run: Run, seconds: float) -> list[str]:
     return [
         f"{_headline(run)}.",
         *(_video_lines(summary["video"]) if "video" in summary else ()),
-        *(_mask_lines(summary["masks"], summary["photos"]["usable"]) if summary["masks"] is not None else ()),
+        *_mask_lines(summary),
         *_accuracy_lines(run),
         *_missing_lines(run, summary["photos"]),
         *_warning_lines(run),
@@ -193,19 +192,13 @@ def _photo_lines(photos: Mapping[str, Any]) -> Iterator[str]:
     for name, notes in photos["notes"].items():
         yield f"{name}: {', '.join(notes)}"
     for reason, names in by_reason.items():
-        yield f"left out: {_abbreviate_names(names)}: {reason}"
+        more = " (manifest.json lists all)" if len(names) > NAMES_SHOWN else ""
+        yield f"left out: {list_names(names, NAMES_SHOWN)}{more}: {reason}"
 
 
-def _mask_lines(masks: Mapping[str, Any], photos: int) -> Iterator[str]:
-    yield f"masks       {masks['photos']} of {photos} photos"
-    if masks.get("white"):
-        yield f"{INDENT}hiding nothing: {_abbreviate_names(masks['white'])}"
-    if masks["unused"]:
-        yield f"{INDENT}unused: {_abbreviate_names(masks['unused'])}"
-
-
-def _abbreviate_names(names: Sequence[str]) -> str:
-    return list_names(names, NAMES_SHOWN) + (" (manifest.json lists all)" if len(names) > NAMES_SHOWN else "")
+def _mask_lines(summary: Mapping[str, Any]) -> Iterator[str]:
+    if summary["masks"] is not None:
+        yield f"masks       {summary['masks']['photos']} of {summary['photos']['usable']} photos"
 
 
 def _texture_text(mesh: Mapping[str, Any]) -> str:

@@ -76,10 +76,7 @@ def terminal_width(stream: TextIO) -> int | None:
 
 
 def fold_lines(lines: Iterable[str], width: int = WIDTH) -> list[str]:
-    """Return lines of at most `width` columns; continuation lines start below the text behind the label.
-
-    Does not break words, such as paths, nor lines of `file_lines`.
-    """
+    """Return lines of at most `width` columns, continued below the text behind the label; words stay whole."""
     folded: list[str] = []
     for line in lines:
         label = LABEL.match(line)

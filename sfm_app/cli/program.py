@@ -100,9 +100,7 @@ class Program(click.Group):
                 sys.stderr.flush()
                 os._exit(INTERRUPTED)
 
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
         """Find the command; if the user names a folder instead, suggest `sfm-app run`."""
         try:
             return super().resolve_command(ctx, args)
@@ -149,10 +147,7 @@ def describe_os_error(err: OSError) -> tuple[str, str]:
 
 
 def fail(message: str, hint: str, code: int) -> None:
-    """Print an error and its hint, and exit with a code > 0.
-
-    Folds lines on a terminal only: elsewhere, the message is one line, and so is each line of the hint.
-    """
+    """Print an error and its hint, and exit with a code > 0."""
     hints = hint.split("\n") if hint else []
     lines = [f"error: {message}", *(f"{'' if number else 'hint: '}{line}" for number, line in enumerate(hints))]
     lines, width = [to_printable(line) for line in lines], terminal_width(sys.stderr)

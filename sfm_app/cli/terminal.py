@@ -5,7 +5,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import TextIO
 
 from rich.console import Console
@@ -29,10 +28,7 @@ INDENT = " " * 6
 
 
 class Terminal(Progress):
-    """Progress on stderr: a line per stage and a bar on a terminal, a few more lines elsewhere, nothing when quiet.
-
-    On a terminal the bar moves as long as a stage runs. Elsewhere, `check_silence` prints the title of a long stage.
-    """
+    """Progress on stderr: a line per stage and a bar on a terminal, a few more lines elsewhere, nothing when quiet."""
 
     def __init__(
         self, *, quiet: bool, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
@@ -65,9 +61,7 @@ class Terminal(Progress):
             threading.Thread(target=self._watch_silence, daemon=True).start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -38,19 +38,19 @@ LEVELS = tuple(level.value for level in (_Level.FATAL, _Level.WARNING, _Level.IN
 # The stubs of pycolmap 4.2 do not type the elements of COLMAP's maps.
 
 
-def all_cameras(model: pycolmap.Reconstruction) -> Iterable[pycolmap.Camera]:
+def all_cameras(model: Reconstruction) -> Iterable[pycolmap.Camera]:
     """Return all cameras of a model."""
     cameras: Iterable[pycolmap.Camera] = model.cameras.values()
     return cameras
 
 
-def all_points(model: pycolmap.Reconstruction) -> Iterable[tuple[int, pycolmap.Point3D]]:
+def all_points(model: Reconstruction) -> Iterable[tuple[int, pycolmap.Point3D]]:
     """Return all points of a model with their ids."""
     points: Iterable[tuple[int, pycolmap.Point3D]] = model.points3D.items()
     return points
 
 
-def largest_model(models: Mapping[int, pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
+def largest_model(models: Mapping[int, Reconstruction]) -> Reconstruction | None:
     """Return the model with most photos; None if there is no model."""
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
@@ -78,12 +78,7 @@ def versions() -> dict[str, str]:
 
 @contextlib.contextmanager
 def translate_errors(doing: str) -> Iterator[None]:
-    """Turn COLMAP's exceptions into a BackendError that names the operation; our own errors pass through.
-
-    Raises:
-        BackendError: COLMAP failed.
-        NumericalError: NumPy failed, or our own computation did.
-    """
+    """Turn exceptions of COLMAP into a BackendError that names the operation, of NumPy into a NumericalError."""
     try:
         yield
     except (SfmError, OSError):
@@ -99,10 +94,7 @@ def translate_errors(doing: str) -> Iterator[None]:
 
 
 def _is_ours(err: Exception) -> bool:
-    """Return whether an error was raised by Python code other than our calls of COLMAP.
-
-    A traceback has no frames of pycolmap itself.
-    """
+    """Return whether an error was raised by Python code other than our calls of COLMAP."""
     if isinstance(err, np.linalg.LinAlgError | ArithmeticError):
         return True
     frames = [frame for frame, _ in traceback.walk_tb(err.__traceback__)]
@@ -122,10 +114,7 @@ def check_written(*files: Path) -> None:
 
 
 def run_in_daemon_thread(call: Callable[[], Result]) -> Result:
-    """Run a COLMAP call that cannot be stopped, so that Ctrl-C takes effect at once.
-
-    After Ctrl-C the call goes on in its daemon thread; see `has_running_call`.
-    """
+    """Run a COLMAP call that cannot be stopped, so that Ctrl-C takes effect at once."""
     future: Future[Result] = Future()
 
     def run() -> None:
@@ -145,11 +134,9 @@ def has_running_call() -> bool:
     return any(thread.name == THREAD_NAME for thread in threading.enumerate())
 
 
-def run_interruptible(
-    call: Callable[[pycolmap.CancellationToken], Result], poll: Callable[[], None] = lambda: None
-) -> Result:
+def run_interruptible(call: Callable[[CancellationToken], Result], poll: Callable[[], None] = lambda: None) -> Result:
     """Run a long COLMAP call in a thread, so that Ctrl-C cancels its token; `poll` is called twice a second."""
-    token = pycolmap.CancellationToken()
+    token = CancellationToken()
     with ThreadPoolExecutor(1, thread_name_prefix="colmap") as thread:
         future = thread.submit(call, token)
         try:
@@ -162,11 +149,7 @@ def run_interruptible(
 
 
 def run_with_progress(
-    call: Callable[[pycolmap.CancellationToken], None],
-    done: Callable[[], int],
-    label: str,
-    total: int,
-    progress: Progress,
+    call: Callable[[CancellationToken], None], done: Callable[[], int], label: str, total: int, progress: Progress
 ) -> None:
     """Run a long COLMAP call as `run_interruptible` does, with a progress bar; `done` counts the finished steps."""
     steps = 0

@@ -12,6 +12,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from sfm_app.bundle import lens_parts
 from sfm_app.bundle.lens_evidence import (
     LensChoice,
     LensEstimate,
@@ -20,20 +21,18 @@ from sfm_app.bundle.lens_evidence import (
     family_evidence,
     suggests_other_family,
 )
-from sfm_app.bundle.lens_parts import (
-    COUNT,
-    NO_RULE,
-    PARTS,
-    CameraRule,
-    LensPriors,
-    calibration_from_params,
-    determined_names,
-    fit_to_model,
-)
 from sfm_app.bundle.normal_equations import Bundle, best_step, bundle_scale, cost, elimination_width, reduce
 from sfm_app.camera.models import FILE_MODELS, INDEX, PARAMETERS, file_model, params_of_row, row_of_calibration
 from sfm_app.camera.rows import CX, CY, FISHEYE, FX, FY, PANORAMA, PERSPECTIVE
-from sfm_app.colmap.backend import all_cameras, all_points, pycolmap, run_in_daemon_thread, translate_errors
+from sfm_app.colmap.backend import (
+    Camera,
+    Reconstruction,
+    all_cameras,
+    all_points,
+    pycolmap,
+    run_in_daemon_thread,
+    translate_errors,
+)
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import RefinedCamera, camera_family, finite_mask, posed_images, read_camera, submodel
 from sfm_app.errors import NumericalError
@@ -44,12 +43,12 @@ from sfm_app.types.camera import named_correlations
 
 # COLMAP's models as the arrays of our bundle adjustment, and back.
 
-Rules = Mapping[int, CameraRule]
+Rules = Mapping[int, lens_parts.CameraRule]
 """The user's rules, by camera id; cameras without a rule are free."""
 NO_RULES: Rules = MappingProxyType({})
 
 
-def write_camera(camera: pycolmap.Camera, params: FloatArray, family: int) -> None:
+def write_camera(camera: Camera, params: FloatArray, family: int) -> None:
     """Change a camera in place to the smallest of FILE_MODELS with these parameters (12,), unless it is a panorama."""
     if family == PANORAMA:
         return
@@ -58,7 +57,7 @@ def write_camera(camera: pycolmap.Camera, params: FloatArray, family: int) -> No
     camera.params = params_of_row(params, name)
 
 
-def read_bundle(model: pycolmap.Reconstruction, rules: Rules = NO_RULES) -> tuple[list[int], Bundle]:
+def read_bundle(model: Reconstruction, rules: Rules = NO_RULES) -> tuple[list[int], Bundle]:
     """Return the ids of the cameras in use, and the model as arrays; cameras that rules keep are fixed."""
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
     ids, points = sorted(photos_per_camera(model)), sorted(model.points3D)
@@ -94,7 +93,7 @@ def _read_observations(
     )
 
 
-def write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle) -> None:
+def write_bundle(model: Reconstruction, ids: list[int], bundle: Bundle) -> None:
     """Write cameras, poses and points, in the order of `read_bundle`, into a model in place."""
     for camera_id, params, family in zip(ids, bundle.params, bundle.family, strict=True):
         write_camera(model.cameras[camera_id], params, int(family))
@@ -105,7 +104,7 @@ def write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle)
         model.points3D[point].xyz = xyz
 
 
-def photos_per_camera(model: pycolmap.Reconstruction) -> Counter[int]:
+def photos_per_camera(model: Reconstruction) -> Counter[int]:
     """Return the number of posed photos of each camera, by its id."""
     return Counter(model.images[image_id].camera_id for image_id in sorted(model.reg_image_ids()))
 
@@ -167,7 +166,7 @@ class Rounds:
 
 
 def adjust_in_rounds(
-    model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph | None, rules: Rules = NO_RULES
+    model: Reconstruction, graph: pycolmap.CorrespondenceGraph | None, rules: Rules = NO_RULES
 ) -> Rounds:
     """Refine cameras, poses, points and tracks of a model in place, until they no longer change.
 
@@ -195,7 +194,7 @@ def adjust_in_rounds(
     return Rounds(ids, bundle, lenses, reduced.noise_px, open_points[0])
 
 
-def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None:
+def solve(model: Reconstruction, refined: Collection[int] = ()) -> None:
     """Adjust poses, points and the focals of `refined` cameras in place, on one thread: sums over several vary."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
@@ -215,20 +214,18 @@ def solve(model: pycolmap.Reconstruction, refined: Collection[int] = ()) -> None
     run_in_daemon_thread(pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve)
 
 
-def _choose_most_factored(model: pycolmap.Reconstruction) -> int:
+def _choose_most_factored(model: Reconstruction) -> int:
     """Return the number of photos up to which COLMAP's solver factors the normal equations: all, or `most_tied`."""
     photos = sorted(model.reg_image_ids())
     if len(photos) <= OPTIONS.most_tied:
         return OPTIONS.most_tied
     rows = {photo: row for row, photo in enumerate(photos)}
-    tracked = [
-        (rows[one.image_id], k) for k, (_, point) in enumerate(all_points(model)) for one in point.track.elements
-    ]
+    tracked = [(rows[one.image_id], k) for k, (_, p) in enumerate(all_points(model)) for one in p.track.elements]
     photo, point = np.array(tracked, np.int64).reshape(-1, 2).T
     return len(photos) if elimination_width(photo, point) <= OPTIONS.most_tied else OPTIONS.most_tied
 
 
-def improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph) -> int:
+def improve_tracks(model: Reconstruction, graph: pycolmap.CorrespondenceGraph) -> int:
     """Continue, merge, triangulate and filter tracks in place; return by how many observations their number changed.
 
     Observations that are added and filtered again do not count: near the limits they come and go forever.
@@ -244,15 +241,17 @@ def improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.Correspondenc
     return abs(int(model.compute_num_observations() - before))
 
 
-def lens_priors(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle, rules: Rules = NO_RULES) -> LensPriors:
+def lens_priors(
+    model: Reconstruction, ids: list[int], bundle: Bundle, rules: Rules = NO_RULES
+) -> lens_parts.LensPriors:
     """Return the priors of the cameras, before any evidence from the bundle."""
     used = photos_per_camera(model)
     sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
     many = np.array([used[camera_id] >= OPTIONS.min_photos for camera_id in ids])
-    always = [[part.name in ("focal", "k1") for part in PARTS[int(kind)]] for kind in bundle.family]
-    estimated = (many[:, None] | np.array(always).reshape(-1, COUNT)) & (bundle.family != PANORAMA)[:, None]
-    of_cameras = [rules.get(camera_id, NO_RULE) for camera_id in ids]
-    return LensPriors.from_cameras(bundle.params, bundle.family, sizes, estimated, of_cameras)
+    always = [[part.name in ("focal", "k1") for part in lens_parts.PARTS[int(kind)]] for kind in bundle.family]
+    estimated = (many[:, None] | np.array(always).reshape(-1, lens_parts.COUNT)) & (bundle.family != PANORAMA)[:, None]
+    of_cameras = [rules.get(camera_id, lens_parts.NO_RULE) for camera_id in ids]
+    return lens_parts.LensPriors.from_cameras(bundle.params, bundle.family, sizes, estimated, of_cameras)
 
 
 # The camera model that the photos support: other families of a lens, and the ranking of all models.
@@ -284,13 +283,13 @@ class LensRecord:
 class Families:
     """A model with cameras of the most probable families."""
 
-    model: pycolmap.Reconstruction
+    model: Reconstruction
     """The given model where no camera changes its family; else another, to be adjusted again."""
     rivals: Mapping[int, LensChoice] = field(default_factory=dict)
     """By camera id, the best model of the rejected family; its evidence is what it loses."""
 
 
-def best_families(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules = NO_RULES) -> Families:
+def best_families(model: Reconstruction, rounds: Rounds, rules: Rules = NO_RULES) -> Families:
     """Choose the family of every camera that suggests the other one, by the evidence of its observations.
 
     Both families are adjusted to the same tracks; `model` stays. Rules may require a camera's family.
@@ -300,14 +299,14 @@ def best_families(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules =
         family, params = int(rounds.bundle.family[row]), rounds.lenses.params[row]
         reach, best = _observed_reach(rounds.bundle, row), rounds.lenses.ranking[row][0]
         many = np.count_nonzero(rounds.bundle.camera == row) >= OPTIONS.min_photos
-        is_open = many and rules.get(camera_id, NO_RULE).family is None
+        is_open = many and rules.get(camera_id, lens_parts.NO_RULE).family is None
         is_doubtful = is_open and suggests_other_family(params, family, reach, best, bool(rounds.lenses.folding[row]))
         other = convert_lens(params, family, reach) if is_doubtful else None
         if other is None:
             continue
         photos = _spread_photos(model, camera_id)
         part = model if photos is None else submodel(model, photos)
-        trial, same = pycolmap.Reconstruction(part), pycolmap.Reconstruction(part)
+        trial, same = Reconstruction(part), Reconstruction(part)
         write_camera(trial.cameras[camera_id], other, FISHEYE if family == PERSPECTIVE else PERSPECTIVE)
         try:
             adjust_in_rounds(same, None, rules)
@@ -323,7 +322,7 @@ def best_families(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules =
     return Families(model, rivals)
 
 
-def _spread_photos(model: pycolmap.Reconstruction, camera_id: int) -> list[int] | None:
+def _spread_photos(model: Reconstruction, camera_id: int) -> list[int] | None:
     """Return photos of a camera at even steps among all of them; None if the model has few photos."""
     if model.num_reg_images() <= OPTIONS.most_compared:
         return None
@@ -331,15 +330,15 @@ def _spread_photos(model: pycolmap.Reconstruction, camera_id: int) -> list[int] 
     return own[:: -(-len(own) // OPTIONS.most_compared)]
 
 
-def _with_camera(model: pycolmap.Reconstruction, camera: pycolmap.Camera) -> pycolmap.Reconstruction:
-    copy = pycolmap.Reconstruction(model)
+def _with_camera(model: Reconstruction, camera: Camera) -> Reconstruction:
+    copy = Reconstruction(model)
     own = copy.cameras[camera.camera_id]
     own.model, own.params = camera.model, camera.params.tolist()
     return copy
 
 
 def _compare(
-    first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, camera_id: int, rules: Rules
+    first: Reconstruction, second: Reconstruction, camera_id: int, rules: Rules
 ) -> tuple[tuple[float, LensChoice], ...]:
     """Return the evidence and the best model of a camera in two models with the same tracks."""
     read = [(model, *read_bundle(model, rules)) for model in (first, second)]
@@ -355,9 +354,7 @@ def _compare(
     return tuple(compared)
 
 
-def record_lenses(
-    model: pycolmap.Reconstruction, rounds: Rounds, others: Mapping[int, LensChoice]
-) -> dict[int, LensRecord]:
+def record_lenses(model: Reconstruction, rounds: Rounds, others: Mapping[int, LensChoice]) -> dict[int, LensRecord]:
     """Return the chosen model of each camera and its rivals, by camera id; `others` are rivals of the other family."""
     records = {}
     for row, camera_id in enumerate(rounds.ids):
@@ -382,7 +379,7 @@ def _observed_reach(bundle: Bundle, row: int) -> float:
 class Adjustment:
     """The refined model, and the uncertainty of its cameras."""
 
-    model: pycolmap.Reconstruction
+    model: Reconstruction
     refined: dict[int, RefinedCamera]
     """By camera id."""
     failure: str = ""
@@ -398,7 +395,7 @@ class Adjustment:
 
 
 def adjust(
-    model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES, *, families_known: bool = False
+    model: Reconstruction, database: Path, rules: Rules = NO_RULES, *, families_known: bool = False
 ) -> Adjustment:
     """Refine cameras, poses, points and tracks in turn; only camera parameters that the photos determine are freed.
 
@@ -407,7 +404,7 @@ def adjust(
     them. Then tracks are completed and filtered. The given model is not changed; with `families_known`, an earlier
     adjustment has chosen between fisheye and perspective lenses. NumericalError if it diverges.
     """
-    model = pycolmap.Reconstruction(model)
+    model = Reconstruction(model)
     for camera in all_cameras(model):
         write_camera(camera, read_camera(camera), camera_family(camera))
     if rules:
@@ -430,7 +427,7 @@ def adjust(
 
 
 def adjust_or_keep(
-    model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES, *, families_known: bool = False
+    model: Reconstruction, database: Path, rules: Rules = NO_RULES, *, families_known: bool = False
 ) -> Adjustment:
     """Adjust a model; where that fails numerically, return the given model with the reason."""
     try:
@@ -442,13 +439,13 @@ def adjust_or_keep(
         return Adjustment(model, dict.fromkeys(photos_per_camera(model), unknown), failure=error_reason(err))
 
 
-def drop_infinite_points(model: pycolmap.Reconstruction) -> None:
+def drop_infinite_points(model: Reconstruction) -> None:
     """Remove points at infinity, in place."""
     for point_id in [key for key, point in all_points(model) if not finite_mask(point.xyz)]:
         model.delete_point3D(point_id)
 
 
-def find_correspondences(model: pycolmap.Reconstruction, database: Path) -> pycolmap.CorrespondenceGraph:
+def find_correspondences(model: Reconstruction, database: Path) -> pycolmap.CorrespondenceGraph:
     """Return the graph of all matches between the photos of a model."""
     options = pycolmap.DatabaseCacheOptions()
     options.load_all_images = True  # else photos that no pair in the database connects would be missing
@@ -466,7 +463,7 @@ def refined_cameras(rounds: Rounds) -> dict[int, RefinedCamera]:
         entries = {name: float(lenses.deviations[row][place]) for name, place in zip(names, places, strict=True)}
         refined[camera_id] = RefinedCamera(
             deviations=finite_entries(entries),
-            determined=determined_names(int(rounds.bundle.family[row]), lenses.determined[row]),
+            determined=lens_parts.determined_names(int(rounds.bundle.family[row]), lenses.determined[row]),
             correlations=named_correlations(names, lenses.mean_squares[row][np.ix_(places, places)]),
         )
     return refined
@@ -481,11 +478,8 @@ def _adjusted_names(rounds: Rounds, row: int) -> tuple[str, ...]:
     return PARAMETERS[file_model(rounds.lenses.params[row], family)]
 
 
-def apply_rules(model: pycolmap.Reconstruction, rules: Rules) -> None:
-    """Give cameras the user's values or model, in place, and adjust poses and points to them.
-
-    Mapping may have changed a camera that is kept, and may have used another model.
-    """
+def apply_rules(model: Reconstruction, rules: Rules) -> None:
+    """Give cameras the user's values or model, in place, and adjust poses and points to them."""
     changed = False
     for camera_id, rule in rules.items():
         camera = model.cameras[camera_id]
@@ -501,23 +495,20 @@ def apply_rules(model: pycolmap.Reconstruction, rules: Rules) -> None:
             params, new_family = (before, family) if other is None else (other, new_family)
         parts = None if rule.is_kept else rule.parts(new_family)
         if parts is not None:
-            params = fit_to_model(params, parts, new_family)
+            params = lens_parts.fit_to_model(params, parts, new_family)
         changed = changed or new_family != family or not np.array_equal(params, before)
         write_camera(camera, params, new_family)
     if changed:
         solve(model)
 
 
-def given_estimates(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules) -> dict[int, Calibration]:
-    """Return estimates of the user's cameras by id, if the photos determine them.
-
-    If one is kept, everything is adjusted once more with free cameras, to the same tracks.
-    """
+def given_estimates(model: Reconstruction, rounds: Rounds, rules: Rules) -> dict[int, Calibration]:
+    """Return estimates of the user's cameras by id, if the photos determine them; kept ones are adjusted again."""
     if all(rule.given is None for rule in rules.values()):
         return {}
     if any(rule.is_kept for rule in rules.values()):
         try:
-            rounds = adjust_in_rounds(pycolmap.Reconstruction(model), None)
+            rounds = adjust_in_rounds(Reconstruction(model), None)
         except FAILURES as err:
             logger.info("the user's cameras could not be checked", exc_info=err)
             return {}
@@ -527,8 +518,8 @@ def given_estimates(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules
         if camera_id not in rules or rules[camera_id].given is None or lenses.held[row] or family == PANORAMA:
             continue
         camera = model.cameras[camera_id]
-        determined = determined_names(family, lenses.determined[row])
-        estimates[camera_id] = calibration_from_params(
+        determined = lens_parts.determined_names(family, lenses.determined[row])
+        estimates[camera_id] = lens_parts.calibration_from_params(
             lenses.params[row], family, (camera.width, camera.height), lenses.deviations[row], determined
         )
     return estimates

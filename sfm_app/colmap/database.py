@@ -24,6 +24,7 @@ from sfm_app.types import (
     PoseGraph,
     RelativePose,
 )
+from sfm_app.types.arrays import ByteArray, Float32Array, FloatArray
 from sfm_app.types.camera import EQUIRECTANGULAR, PERSPECTIVE
 
 SQUARE_PIXELS = "SIMPLE_RADIAL"
@@ -89,10 +90,7 @@ def remove_database(path: Path) -> None:
 
 
 def create_database(path: Path, photos: PhotoSet) -> None:
-    """Make a database of photos and cameras in a fixed order.
-
-    Feature extraction would enter them in the order in which its threads finish, which differs from run to run.
-    """
+    """Make a database of photos and cameras in a fixed order, which threads of feature extraction would not keep."""
     images = {key: matched_image(key, photo) for key, photo in enumerate(ordered_photos(photos), start=1)}
     write_match_graph(path, MatchGraph(images, {}, {}))
 
@@ -139,7 +137,7 @@ def unmatched_pairs(path: Path, pairs: Sequence[PairId]) -> list[PairId]:
         return [pair for pair in pairs if not database.exists_matches(*pair)]
 
 
-def write_keypoints(path: Path, photo: int, keypoints: NDArray[np.float32]) -> None:
+def write_keypoints(path: Path, photo: int, keypoints: Float32Array) -> None:
     """Enter the keypoints (N, 2) of a photo in pixels, or replace them."""
     with open_database(path) as database:
         _put_keypoints(database, photo, keypoints)
@@ -179,7 +177,7 @@ def write_match_graph(path: Path, matches: MatchGraph) -> None:
             database.write_matches(*pair, np.ascontiguousarray(rows, np.uint32))
 
 
-def read_features(path: Path) -> tuple[dict[int, NDArray[np.float64]], dict[PairId, NDArray[np.uint32]]]:
+def read_features(path: Path) -> tuple[dict[int, FloatArray], dict[PairId, NDArray[np.uint32]]]:
     """Return keypoints (N, 2) of every photo that has any, and the raw matches of pairs."""
     with open_database(path) as database:
         features = {image.image_id: database.read_keypoints(image.image_id) for image in database.read_all_images()}
@@ -286,7 +284,7 @@ def _two_view_geometry(pose: RelativePose, matches: NDArray[np.uint32]) -> pycol
     return geometry
 
 
-def largest_descriptors(path: Path, photo: int, most: int) -> NDArray[np.uint8]:
+def largest_descriptors(path: Path, photo: int, most: int) -> ByteArray:
     """Return descriptors (N, 128) of the `most` largest features of a photo, largest first; none where it has none."""
     with open_database(path) as database:
         if not database.exists_descriptors(photo):

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.colmap import tasks
-from sfm_app.colmap.backend import check_written, pycolmap, translate_errors
+from sfm_app.colmap.backend import Camera, Reconstruction, check_written, pycolmap, translate_errors
 from sfm_app.colmap.model import all_images
 from sfm_app.colmap.worker_process import run_worker
 from sfm_app.files import digest_files, is_below
@@ -22,7 +21,7 @@ from sfm_app.progress import Progress
 from sfm_app.settings import MOST_LEVELS
 from sfm_app.stereo import DepthEstimate, DepthMap, Kind, View
 from sfm_app.tasks import Shared
-from sfm_app.types.arrays import BoolArray
+from sfm_app.types.arrays import BoolArray, ByteArray, Float32Array
 
 MASKS = "masks"
 DEPTHS, NORMALS, CONFIDENCES = "depth_maps", "normal_maps", "confidence_maps"
@@ -32,14 +31,14 @@ MAPS = ("sparse", "images", f"stereo/{DEPTHS}", f"stereo/{NORMALS}")
 """Folders from which a finished workspace is read."""
 
 
-def cameras_of_photos(model_dir: Path) -> dict[str, pycolmap.Camera]:
+def cameras_of_photos(model_dir: Path) -> dict[str, Camera]:
     """Return the camera of each photo of a model, by name."""
     with translate_errors("reading the model"):
-        model = pycolmap.Reconstruction(model_dir)
+        model = Reconstruction(model_dir)
         return {image.name: model.cameras[image.camera_id] for image in all_images(model)}
 
 
-def undistort_mask(cameras: Shared[Mapping[str, pycolmap.Camera]], mask_dir: Path, dense_dir: Path, view: View) -> None:
+def undistort_mask(cameras: Shared[Mapping[str, Camera]], mask_dir: Path, dense_dir: Path, view: View) -> None:
     """Write the mask of an undistorted photo: a pixel is used if all original pixels under it are."""
     used, camera = read_mask(mask_dir, view.name), cameras.value[view.name]
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
@@ -66,10 +65,7 @@ def used_pixels(dense_dir: Path, view: View) -> BoolArray | None:
 
 
 def shrink_mask(used: BoolArray) -> BoolArray:
-    """Return the mask (H, W) of an undistorted photo without the two pixels beside masked ones.
-
-    Colors there are mixed: they are interpolated between four pixels, at most half a pixel aside.
-    """
+    """Return the mask (H, W) of an undistorted photo without the two pixels beside masked ones."""
     return _erode(used, 2)
 
 
@@ -90,14 +86,14 @@ def undistort(
 def read_views(dense_dir: Path) -> list[View]:
     """Return the undistorted views with the sparse points that they observe, by name."""
     with translate_errors("reading the undistorted model"):
-        model = pycolmap.Reconstruction(dense_dir / "sparse")
+        model = Reconstruction(dense_dir / "sparse")
         images = sorted(all_images(model), key=lambda image: image.name)
         if not all(is_below(image.name) for image in images):
             raise ValueError(f"the model in {dense_dir} names photos outside of it")
         return [_view(model, image) for image in images if image.has_pose]
 
 
-def _view(model: pycolmap.Reconstruction, image: pycolmap.Image) -> View:
+def _view(model: Reconstruction, image: pycolmap.Image) -> View:
     camera = model.cameras[image.camera_id]
     ids = sorted({point.point3D_id for point in image.points2D if point.has_point3D()})
     return View(
@@ -113,12 +109,12 @@ def _view(model: pycolmap.Reconstruction, image: pycolmap.Image) -> View:
     )
 
 
-def read_gray(dense_dir: Path, view: View) -> NDArray[np.uint8]:
+def read_gray(dense_dir: Path, view: View) -> ByteArray:
     """Return the undistorted photo (H, W) of a view."""
     return np.asarray(_decode(dense_dir, view.name, cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
-def _decode(dense_dir: Path, name: str, flags: int) -> NDArray[np.uint8] | None:
+def _decode(dense_dir: Path, name: str, flags: int) -> ByteArray | None:
     # imdecode, because OpenCV does not open names beyond ASCII on every system
     image = cv2.imdecode(np.fromfile(dense_dir / "images" / name, np.uint8), flags)
     return None if image is None else np.asarray(image, np.uint8)
@@ -140,7 +136,7 @@ class DenseStore:
     def __init__(self, dense_dir: Path) -> None:
         self.dense_dir = dense_dir
 
-    def photo(self, view: View) -> NDArray[np.uint8]:
+    def photo(self, view: View) -> ByteArray:
         """Return the undistorted photo (H, W) at the size of the view."""
         photo = read_gray(self.dense_dir, view)
         return _resize(photo, view) if view.level else photo
@@ -155,7 +151,7 @@ class DenseStore:
         confidences = _map_path(self.dense_dir, CONFIDENCES, view, "photometric")
         return DepthEstimate(self.read_depth(view), _read_depth_format(confidences, view.name))
 
-    def read_depth(self, view: View, kind: Kind = "photometric") -> NDArray[np.float32]:
+    def read_depth(self, view: View, kind: Kind = "photometric") -> Float32Array:
         """Read the depths of a map of a view."""
         return read_depth(self.dense_dir, view, kind)
 
@@ -169,7 +165,7 @@ class DenseStore:
         normals = np.ascontiguousarray(planes.reshape(3, height, width).transpose(1, 2, 0))
         return DepthMap(self.read_depth(view, "geometric"), normals)
 
-    def write_proposal(self, view: View, depth: NDArray[np.float32]) -> None:
+    def write_proposal(self, view: View, depth: Float32Array) -> None:
         """Write proposed depths (H, W) of the plain areas of a view, 0 where unknown."""
         _write_depth_format(self.dense_dir, DEPTHS, view, depth, "proposed")
 
@@ -196,12 +192,12 @@ class DenseStore:
         write_depth(self.dense_dir, view, maps.depth)
 
 
-def read_depth(dense_dir: Path, view: View, kind: Kind) -> NDArray[np.float32]:
+def read_depth(dense_dir: Path, view: View, kind: Kind) -> Float32Array:
     """Read a depth map (H, W): 0 where unknown, MASKED where the photo is masked, SKY where it shows the sky."""
     return _read_depth_format(_map_path(dense_dir, DEPTHS, view, kind), view.name)
 
 
-def write_depth(dense_dir: Path, view: View, depth: NDArray[np.float32]) -> None:
+def write_depth(dense_dir: Path, view: View, depth: Float32Array) -> None:
     """Write the confirmed depths (H, W) of a view, 0 where unknown."""
     _write_depth_format(dense_dir, DEPTHS, view, depth, "geometric")
 
@@ -234,14 +230,14 @@ def digest_maps(dense_dir: Path) -> str:
     return digest_files(dense_dir, *MAPS)
 
 
-def _read_depth_format(path: Path, photo: str) -> NDArray[np.float32]:
+def _read_depth_format(path: Path, photo: str) -> Float32Array:
     with translate_errors(f"reading the depth map of {photo}"):
         stored = pycolmap.DepthMap()
         stored.read(path)
     return np.array(stored.to_array(), np.float32)
 
 
-def _write_depth_format(dense_dir: Path, folder: str, view: View, values: NDArray[np.float32], kind: Kind) -> None:
+def _write_depth_format(dense_dir: Path, folder: str, view: View, values: Float32Array, kind: Kind) -> None:
     known = values[values > 0]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     with (
@@ -255,7 +251,7 @@ def _map_path(dense_dir: Path, folder: str, view: View, kind: Kind) -> Path:
     return dense_dir / "stereo" / folder / f"{view.name}.{kind}{view.level or ''}.bin"
 
 
-def _resize(picture: NDArray[np.uint8], view: View) -> NDArray[np.uint8]:
+def _resize(picture: ByteArray, view: View) -> ByteArray:
     return np.asarray(cv2.resize(picture, (view.width, view.height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
@@ -269,7 +265,7 @@ def _atomic_path(target: Path) -> Iterator[Path]:
     replace_file(beside, target)
 
 
-def read_photo_and_depth(dense_dir: Path, name: str) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+def read_photo_and_depth(dense_dir: Path, name: str) -> tuple[ByteArray, Float32Array]:
     """Return the undistorted photo (H, W, 3) RGB and its confirmed depths (H, W), <= 0 where there is none.
 
     Raises:

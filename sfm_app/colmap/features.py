@@ -22,7 +22,6 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.colmap.backend import pycolmap, run_with_progress, translate_errors
@@ -34,6 +33,7 @@ from sfm_app.photos.masks import read_mask
 from sfm_app.progress import Progress
 from sfm_app.settings import MatchSettings
 from sfm_app.types import PairId
+from sfm_app.types.arrays import ByteArray, FloatArray
 
 Token: TypeAlias = pycolmap.CancellationToken
 Extraction: TypeAlias = pycolmap.FeatureExtractionOptions
@@ -53,7 +53,7 @@ class SiftSettings:
     """Options of COLMAP's SIFT that differ from its defaults."""
 
 
-SiftFeatures: TypeAlias = tuple[NDArray[np.float64], NDArray[np.uint8]]
+SiftFeatures: TypeAlias = tuple[FloatArray, ByteArray]
 """Keypoints (N, 6) in pixels, with their shapes as in COLMAP's database, and descriptors (N, 128)."""
 
 
@@ -75,9 +75,7 @@ def find_sift(database: Path, settings: SiftSettings, names: Sequence[str], work
     def call(token: Token) -> None:
         for first in range(0, len(new), batch):
             some = {name: sizes[name] for name in new[first : first + batch]}
-            features = _find_in_photos(
-                {name: some[name] for name in some.keys() - panoramas}, settings, extraction, token
-            )
+            features = _find_in_photos({k: some[k] for k in some.keys() - panoramas}, settings, extraction, token)
             for name in some.keys() & panoramas:
                 features[name] = _find_in_panorama(name, settings, extraction, token)
             if token.is_cancelled:
@@ -110,11 +108,7 @@ def _extraction_options(settings: SiftSettings, workers: int) -> Extraction:
 def _find_in_photos(
     sizes: Mapping[str, Size], settings: SiftSettings, extraction: Extraction, token: Token
 ) -> dict[str, SiftFeatures]:
-    """Return the features of photos by name.
-
-    The number of features grows with the area. Photos with half of `enlarge_below` or more get twice the area, those
-    with fewer twice the size.
-    """
+    """Return the features of photos by name, of photos with few after enlarging them."""
     options, masks = settings.options, settings.masks
     features = _drop_masked(_extract(settings.photos, sizes, extraction, token), masks)
     if settings.sift:
@@ -133,7 +127,7 @@ def _find_in_photos(
     return {name: _largest(found, options.max_features) for name, found in features.items()}
 
 
-def _enlarge(path: Path, options: MatchSettings) -> NDArray[np.uint8] | None:
+def _enlarge(path: Path, options: MatchSettings) -> ByteArray | None:
     """Return a photo (H, W) with twice the area at which features are found; None if OpenCV cannot read it."""
     photo = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if photo is None:
@@ -146,7 +140,7 @@ def _enlarge(path: Path, options: MatchSettings) -> NDArray[np.uint8] | None:
 
 
 def _extract_pictures(
-    pictures: Mapping[str, NDArray[np.uint8]], extraction: Extraction, token: Token
+    pictures: Mapping[str, ByteArray], extraction: Extraction, token: Token
 ) -> dict[str, SiftFeatures]:
     """Return the SIFT features of pictures at their own size."""
     own_size, files = copy.copy(extraction), {f"{number:03d}.png": name for number, name in enumerate(pictures)}

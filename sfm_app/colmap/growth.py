@@ -40,10 +40,7 @@ def grow_database(path: Path, earlier: Path, photos: PhotoSet, known: Collection
 
 
 def forget_changed_matches(path: Path, earlier: Path) -> frozenset[str]:
-    """Remove the matches of photos whose keypoints differ from those of an earlier run, and return their names.
-
-    A method that finds features again may find others, and matches are rows of keypoints.
-    """
+    """Remove the matches of photos whose keypoints differ from those of an earlier run, and return their names."""
     query = "SELECT image_id, rows, cols, data FROM keypoints"
     with _connection(earlier) as before, _connection(path) as now:
         old = {key: values for key, *values in before.execute(query)}

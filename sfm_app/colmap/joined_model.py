@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_app.colmap.backend import all_points, pycolmap, translate_errors
+from sfm_app.colmap.backend import Camera, Reconstruction, all_points, pycolmap, translate_errors
 from sfm_app.colmap.bundle import drop_infinite_points, find_correspondences, improve_tracks, solve
 from sfm_app.colmap.model import bearing_vectors, pose_photo, posed_images, unposed_model
 from sfm_app.types.arrays import FloatArray, IndexArray
@@ -28,7 +28,7 @@ class PlacedPhotos:
     photo: IndexArray
     keypoint: IndexArray
     """(N,) each: row of the point of each observation, ascending; id of its photo; index of its keypoint."""
-    cameras: Mapping[int, pycolmap.Camera]
+    cameras: Mapping[int, Camera]
     """Camera of each photo, by its id."""
 
     def bearings(self, photo: int, x: FloatArray) -> FloatArray:
@@ -39,12 +39,12 @@ class PlacedPhotos:
 def read_placed(model_dir: Path) -> PlacedPhotos:
     """Read a model on disk."""
     with translate_errors("reading the model of a part"):
-        model = pycolmap.Reconstruction(model_dir)
+        model = Reconstruction(model_dir)
         images = posed_images(model)
         poses = np.array([image.cam_from_world().matrix() for image in images], np.float64).reshape(-1, 3, 4)
         points = sorted(all_points(model), key=lambda entry: entry[0])
         tracks = [[(one.image_id, one.point2D_idx) for one in point.track.elements] for _, point in points]
-        cameras = {image.image_id: pycolmap.Camera(model.cameras[image.camera_id].todict()) for image in images}
+        cameras = {image.image_id: Camera(model.cameras[image.camera_id].todict()) for image in images}
         X = np.array([point.xyz for _, point in points], np.float64).reshape(-1, 3)
     elements = np.array([element for track in tracks for element in track], np.int64).reshape(-1, 2)
     R = poses[:, :, :3]
@@ -54,12 +54,8 @@ def read_placed(model_dir: Path) -> PlacedPhotos:
     return PlacedPhotos(np.array(sorted(cameras), np.int64), R, centers, X, point, photo, keypoint, cameras)
 
 
-def write_placed(database: Path, placed: PlacedPhotos) -> pycolmap.Reconstruction:
-    """Return poses and points as COLMAP's model, with the photos of a database.
-
-    Of the cameras of photos that share one in the database, the camera with the median focal is taken. Each keypoint is
-    in one point at most.
-    """
+def write_placed(database: Path, placed: PlacedPhotos) -> Reconstruction:
+    """Return poses and points as COLMAP's model, with the photos of a database and cameras of median focal."""
     model = unposed_model(database)
     _write_cameras(model, placed)
     for photo, R, center in zip(placed.photos.tolist(), placed.R, placed.centers, strict=True):
@@ -75,7 +71,7 @@ def write_placed(database: Path, placed: PlacedPhotos) -> pycolmap.Reconstructio
     return model
 
 
-def _write_cameras(model: pycolmap.Reconstruction, placed: PlacedPhotos) -> None:
+def _write_cameras(model: Reconstruction, placed: PlacedPhotos) -> None:
     ranked_focals: dict[int, list[tuple[float, int]]] = {}
     for photo in placed.photos.tolist():
         known = placed.cameras[photo]
@@ -86,7 +82,7 @@ def _write_cameras(model: pycolmap.Reconstruction, placed: PlacedPhotos) -> None
         camera.model, camera.params = known.model, known.params.tolist()
 
 
-def adjust_joined(model: pycolmap.Reconstruction, database: Path, refined: Sequence[int]) -> None:
+def adjust_joined(model: Reconstruction, database: Path, refined: Sequence[int]) -> None:
     """Adjust a joined model and the focals of `refined` cameras in place, and complete, merge and filter its tracks."""
     drop_infinite_points(model)
     graph = find_correspondences(model, database)

@@ -9,8 +9,7 @@ from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 
-from sfm_app.colmap import tasks
-from sfm_app.colmap.backend import CancellationToken, all_cameras, check_written, largest_model, pycolmap
+from sfm_app.colmap import backend, tasks
 from sfm_app.colmap.database import SQUARE_PIXELS
 from sfm_app.colmap.worker_process import start_worker
 
@@ -18,12 +17,12 @@ from sfm_app.colmap.worker_process import start_worker
 def map_incrementally(
     database: Path,
     photo_dir: Path,
-    start: pycolmap.Reconstruction,
+    start: backend.Reconstruction,
     scratch: Path,
-    options: pycolmap.IncrementalPipelineOptions,
+    options: backend.pycolmap.IncrementalPipelineOptions,
     tick: Callable[[], None],
-    token: pycolmap.CancellationToken,
-) -> pycolmap.Reconstruction | None:
+    token: backend.CancellationToken,
+) -> backend.Reconstruction | None:
     """Register photo by photo, beginning with two or more in `start`; return None when COLMAP gives no model.
 
     The scratch folder is emptied first and removed afterwards; `tick` is called before every further photo.
@@ -32,15 +31,18 @@ def map_incrementally(
     for name in ("start", "grown"):
         (scratch / name).mkdir(parents=True)
     start.write(scratch / "start")
-    check_written(*(scratch / "start").iterdir())
-    seek_lens = options.ba_refine_focal_length and all(_has_unknown_lens(camera) for camera in all_cameras(start))
+    backend.check_written(*(scratch / "start").iterdir())
+    seek_lens = options.ba_refine_focal_length and all(
+        bool(camera.model.name == SQUARE_PIXELS and camera.params[camera.extra_params_idxs()[0]] == 0.0)
+        for camera in backend.all_cameras(start)
+    )
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = seek_lens
-    models = pycolmap.incremental_mapping(
+    models = backend.pycolmap.incremental_mapping(
         database, photo_dir, scratch / "grown", options,
         input_path=scratch / "start", next_image_callback=tick, cancellation_token=token,
     )  # fmt: skip
     shutil.rmtree(scratch, ignore_errors=True)
-    return largest_model(models)
+    return backend.largest_model(models)
 
 
 def copy_database(database: Path, scratch: Path) -> None:
@@ -51,8 +53,8 @@ def copy_database(database: Path, scratch: Path) -> None:
 
 
 def map_globally(
-    photo_dir: Path, names: Sequence[str], scratch: Path, seed: int, token: CancellationToken
-) -> pycolmap.Reconstruction | None:
+    photo_dir: Path, names: Sequence[str], scratch: Path, seed: int, token: backend.CancellationToken
+) -> backend.Reconstruction | None:
     """Find the poses of all these photos at once (GLOMAP: rotations, positions, adjustment); None if it gave no model.
 
     COLMAP has no way to stop this, so it runs in a separate process. The folder, from `copy_database`, is removed.
@@ -62,19 +64,16 @@ def map_globally(
 
 
 def map_with_colmap_defaults(
-    photo_dir: Path, scratch: Path, seed: int, token: CancellationToken
-) -> pycolmap.Reconstruction | None:
-    """Verify the raw matches and map the photos by COLMAP's defaults, with the cameras of the database as first guess.
-
-    Only the raw matches and the guess are ours. Result and errors are those of `map_globally`.
-    """
+    photo_dir: Path, scratch: Path, seed: int, token: backend.CancellationToken
+) -> backend.Reconstruction | None:
+    """Verify the raw matches and map the photos by COLMAP's defaults, with the database's cameras as first guess."""
     call = partial(tasks.map_with_defaults, scratch, photo_dir, seed)
     return _map_in_process(call, scratch, "mapping photos by its defaults", token)
 
 
 def _map_in_process(
-    call: Callable[[], None], scratch: Path, doing: str, token: CancellationToken
-) -> pycolmap.Reconstruction | None:
+    call: Callable[[], None], scratch: Path, doing: str, token: backend.CancellationToken
+) -> backend.Reconstruction | None:
     try:
         with start_worker(call) as process:
             while not process.has_ended(0.1):
@@ -82,20 +81,16 @@ def _map_in_process(
                     return None
             process.check(doing)
         model_dir = scratch / "model"
-        return pycolmap.Reconstruction(model_dir) if model_dir.exists() else None
+        return backend.Reconstruction(model_dir) if model_dir.exists() else None
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
 def incremental_options(
     seed: int, *, known: bool = False, kept: Collection[int] = ()
-) -> pycolmap.IncrementalPipelineOptions:
-    """Return COLMAP's defaults, except that two photos make a model and only the given model is extended.
-
-    Adjustments stop when they gain little: the last adjustment is ours. With known cameras, poses and points alone
-    converge in a few steps. Cameras in `kept` do not change.
-    """
-    options = pycolmap.IncrementalPipelineOptions()
+) -> backend.pycolmap.IncrementalPipelineOptions:
+    """Return COLMAP's defaults, except that two photos make a model, which converges coarsely; `kept` cameras stay."""
+    options = backend.pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 2
     options.multiple_models = False
     options.constant_cameras = set(kept)
@@ -110,11 +105,3 @@ def incremental_options(
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
     return options
-
-
-def _has_unknown_lens(camera: pycolmap.Camera) -> bool:
-    """Return whether mapping has to estimate the lens: a known one stays fixed until the last adjustment.
-
-    On the first few photos even one distortion term varies more than the noise explains, and four diverge.
-    """
-    return bool(camera.model.name == SQUARE_PIXELS and camera.params[camera.extra_params_idxs()[0]] == 0.0)

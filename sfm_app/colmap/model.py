@@ -11,40 +11,39 @@ from numpy.typing import NDArray
 from sfm_app.camera.models import FAMILIES, camera_matrix, projection_of_model, row_of_model
 from sfm_app.camera.projection import BEARING, RAY
 from sfm_app.camera.rows import FISHEYE, K1, PERSPECTIVE
-from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread, translate_errors
+from sfm_app.colmap.backend import Camera, Reconstruction, pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.geometry.epipolar import TwoViewSeed
 from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import finite_entries
 from sfm_app.types import CameraModel, Model, PairId, PosedPhoto, Scene, SceneArrays, Surface
+from sfm_app.types.arrays import BoolArray, ByteArray, FloatArray, IndexArray
 
 
-def finite_mask(xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
+def finite_mask(xyz: FloatArray) -> BoolArray:
     """Return (...) which points (..., 3) are finite, and near enough that squares do not overflow."""
     return np.asarray((np.abs(xyz) < 1e100).all(axis=-1))
 
 
-def unposed_model(database: Path, *, unconnected: bool = True) -> pycolmap.Reconstruction:
+def unposed_model(database: Path, *, unconnected: bool = True) -> Reconstruction:
     """Return a database as a model without poses and points, with or without photos that no pair connects."""
     options = pycolmap.DatabaseCacheOptions()
     options.load_all_images = unconnected
     with open_database(database) as db:
         cache = pycolmap.DatabaseCache.create(db, options)
-    model = pycolmap.Reconstruction()
+    model = Reconstruction()
     model.load(cache)
     return model
 
 
-def pose_photo(model: pycolmap.Reconstruction, photo: int, cam_from_world: pycolmap.Rigid3d) -> None:
+def pose_photo(model: Reconstruction, photo: int, cam_from_world: pycolmap.Rigid3d) -> None:
     """Give a photo of a model its pose, in place."""
     image = model.images[photo]
     model.frames[image.frame_id].set_cam_from_world(image.camera_id, cam_from_world)
     model.register_frame(image.frame_id)
 
 
-def model_from_seed(
-    database: Path, pair: PairId, matches: NDArray[np.uint32], seed: TwoViewSeed
-) -> pycolmap.Reconstruction:
+def model_from_seed(database: Path, pair: PairId, matches: NDArray[np.uint32], seed: TwoViewSeed) -> Reconstruction:
     """Return a model of two photos with our pose and our usable points, one per row of the matches (N, 2)."""
     model = unposed_model(database, unconnected=False)
     for photo, R, t in ((pair[0], np.eye(3), np.zeros(3)), (pair[1], seed.R, seed.t)):
@@ -61,14 +60,14 @@ def model_from_seed(
 class PlacedView:
     """A posed photo and the bearing vectors of its keypoints."""
 
-    R: NDArray[np.float64]
-    t: NDArray[np.float64]
+    R: FloatArray
+    t: FloatArray
     """(3, 3) rotation and (3,) translation, camera from world."""
-    lines: NDArray[np.float64]
+    lines: FloatArray
     """(N, 9) bearing vectors of keypoints, see `camera.bearings`."""
 
 
-def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray[np.float64]]) -> dict[int, PlacedView]:
+def placed_views(model: Reconstruction, keypoints: Mapping[int, FloatArray]) -> dict[int, PlacedView]:
     """Return all photos of a model that have a pose, by id; keypoints are (N, 2) pixels."""
     views = {}
     for image in posed_images(model):
@@ -78,17 +77,17 @@ def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray
     return views
 
 
-def camera_family(camera: pycolmap.Camera) -> int:
+def camera_family(camera: Camera) -> int:
     """Return the family of a camera, as in `camera.projection`."""
     return FAMILIES[projection_of_model(camera.model.name)]
 
 
-def read_camera(camera: pycolmap.Camera) -> NDArray[np.float64]:
+def read_camera(camera: Camera) -> FloatArray:
     """Return the parameters (12,) of a camera, as in `camera.projection`."""
     return row_of_model(camera.model.name, camera.params)
 
 
-def bearing_vectors(camera: pycolmap.Camera, x: NDArray[np.float64]) -> NDArray[np.float64]:
+def bearing_vectors(camera: Camera, x: FloatArray) -> FloatArray:
     """Return bearing vectors (N, 9) of pixels (N, 2), as `camera.bearings` does."""
     if camera_family(camera) != PERSPECTIVE:
         # step of the derivatives: curvature and rounding in double precision cost about 1e-9 of them
@@ -102,30 +101,30 @@ def bearing_vectors(camera: pycolmap.Camera, x: NDArray[np.float64]) -> NDArray[
     return lines
 
 
-def posed_photo_ids(model: pycolmap.Reconstruction) -> list[int]:
+def posed_photo_ids(model: Reconstruction) -> list[int]:
     """Return the ids of the posed photos of a model, in order."""
     return [image.image_id for image in posed_images(model)]
 
 
-def cameras_by_photo(model: pycolmap.Reconstruction) -> dict[int, tuple[NDArray[np.float64], tuple[float, ...]]]:
+def cameras_by_photo(model: Reconstruction) -> dict[int, tuple[FloatArray, tuple[float, ...]]]:
     """Return K (3, 3) and `Calibration.distortion` of every posed photo, by id: k1; of a fisheye, all radial terms."""
     return {image.image_id: _matrix_and_terms(model.cameras[image.camera_id]) for image in posed_images(model)}
 
 
-def _matrix_and_terms(camera: pycolmap.Camera) -> tuple[NDArray[np.float64], tuple[float, ...]]:
+def _matrix_and_terms(camera: Camera) -> tuple[FloatArray, tuple[float, ...]]:
     k1, k2, _, _, k3, k4, *_ = read_camera(camera)[K1:].tolist()
     is_fisheye = camera_family(camera) == FISHEYE
     return scale_matrix(camera), (k1, k2, 0.0, 0.0, k3, k4) if is_fisheye else (k1,)
 
 
-def color_points(model: pycolmap.Reconstruction, photo_dir: Path, workers: int) -> None:
+def color_points(model: Reconstruction, photo_dir: Path, workers: int) -> None:
     """Give every point the mean color of its pixels, in place."""
     run_in_daemon_thread(lambda: model.extract_colors_for_all_images(photo_dir, num_threads=workers))
 
 
-def submodel(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.Reconstruction:
+def submodel(model: Reconstruction, photos: Sequence[int]) -> Reconstruction:
     """Return a copy of a model with only the given photos, and the points that at least two of them see."""
-    part, members = pycolmap.Reconstruction(model), set(photos)
+    part, members = Reconstruction(model), set(photos)
     for image in posed_images(model):
         if image.image_id not in members:
             part.deregister_frame(image.frame_id)
@@ -133,30 +132,30 @@ def submodel(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.
     return part
 
 
-def all_images(model: pycolmap.Reconstruction) -> Iterable[pycolmap.Image]:
+def all_images(model: Reconstruction) -> Iterable[pycolmap.Image]:
     """Return all photos of a model, with and without a pose."""
     images: Iterable[pycolmap.Image] = model.images.values()  # the stubs of pycolmap 4.2 do not type them
     return images
 
 
-def posed_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+def posed_images(model: Reconstruction) -> list[pycolmap.Image]:
     """Return the posed photos of a model, in order of ids."""
     return sorted((image for image in all_images(model) if image.has_pose), key=lambda image: image.image_id)
 
 
-def poses_and_points(model: pycolmap.Reconstruction) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.float64]]:
+def poses_and_points(model: Reconstruction) -> tuple[dict[int, FloatArray], FloatArray]:
     """Return (3, 4) cam_from_world of the posed photos by id, in order of ids, and the points (P, 3)."""
     poses = {image.image_id: np.asarray(image.cam_from_world().matrix(), np.float64) for image in posed_images(model)}
     points = np.array([model.points3D[key].xyz for key in sorted(model.points3D)]).reshape(-1, 3)
     return poses, points
 
 
-def finite_points(model: pycolmap.Reconstruction) -> list[pycolmap.Point3D]:
+def finite_points(model: Reconstruction) -> list[pycolmap.Point3D]:
     """Return the finite points of a model, in order of ids."""
     return [model.points3D[key] for key in sorted(model.points3D) if finite_mask(model.points3D[key].xyz)]
 
 
-def point_arrays(points: Sequence[pycolmap.Point3D]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def point_arrays(points: Sequence[pycolmap.Point3D]) -> tuple[FloatArray, ByteArray]:
     """Return positions (P, 3) and colors (P, 3) of points."""
     xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     return xyz, np.array([point.color for point in points], np.uint8).reshape(-1, 3)
@@ -166,15 +165,15 @@ def point_arrays(points: Sequence[pycolmap.Point3D]) -> tuple[NDArray[np.float64
 class SeenPoints:
     """Points of a model, and the photos that see them."""
 
-    points: NDArray[np.float64]
+    points: FloatArray
     """(P, 3)"""
-    colors: NDArray[np.uint8]
+    colors: ByteArray
     """(P, 3)"""
-    seen: tuple[NDArray[np.int64], ...]
+    seen: tuple[IndexArray, ...]
     """For each posed photo, in order of ids, the rows of its points."""
 
 
-def seen_points(model: pycolmap.Reconstruction, most: int) -> SeenPoints:
+def seen_points(model: Reconstruction, most: int) -> SeenPoints:
     """Return the finite points of a colored model, or a sample of at most `most`, drawn with a fixed seed."""
     points = finite_points(model)
     sample = [points[k] for k in np.sort(np.random.default_rng(0).permutation(len(points))[:most])]
@@ -185,30 +184,30 @@ def seen_points(model: pycolmap.Reconstruction, most: int) -> SeenPoints:
     return SeenPoints(*point_arrays(sample), tuple(np.array(own, np.int64) for own in rows.values()))
 
 
-def scale_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:
+def scale_matrix(camera: Camera) -> FloatArray:
     """Return K (3, 3) of a camera; of a panorama, the scale at its center."""
     return camera_matrix(*read_camera(camera)[:4].tolist())
 
 
-def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
+def viewing_rays(model: Reconstruction, image_id: int, x: FloatArray) -> FloatArray:
     """Return viewing directions (N, 3), of any length, of pixels (N, 2) of a posed photo, in the frame of the world."""
     image = model.images[image_id]
     R = image.cam_from_world().matrix()[:, :3]
     return np.asarray(bearing_vectors(model.cameras[image.camera_id], np.asarray(x, np.float64))[:, RAY] @ R)
 
 
-def focal_px(model: pycolmap.Reconstruction, image_id: int) -> float:
+def focal_px(model: Reconstruction, image_id: int) -> float:
     """Return the focal length of the camera of a photo, in pixels."""
     return float(np.sqrt(np.prod(np.diag(scale_matrix(model.cameras[model.images[image_id].camera_id]))[:2])))
 
 
-def move(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
+def move(model: Reconstruction, similarity: Similarity) -> None:
     """Move a model in place, by a similarity from its frame into the new one."""
     rotation = pycolmap.Rotation3d(similarity.R)
     model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.t))
 
 
-def model_arrays(model: pycolmap.Reconstruction, *, metric: bool) -> SceneArrays:
+def model_arrays(model: Reconstruction, *, metric: bool) -> SceneArrays:
     """Return poses, cameras, points and tracks of a model, whose unit may be the meter (`metric`)."""
     images = sorted(posed_images(model), key=lambda image: image.name)
     cameras = [model.cameras[image.camera_id] for image in images]
@@ -244,10 +243,10 @@ def model_arrays(model: pycolmap.Reconstruction, *, metric: bool) -> SceneArrays
 # The model on disk.
 
 
-def read_model(model_dir: Path, frame: Similarity | None = None) -> pycolmap.Reconstruction:
+def read_model(model_dir: Path, frame: Similarity | None = None) -> Reconstruction:
     """Read a model on disk, and move it by a similarity, if one is given."""
     with translate_errors("reading the sparse model"):
-        model = pycolmap.Reconstruction(model_dir)
+        model = Reconstruction(model_dir)
         if frame is not None:
             move(model, frame)
     return model
@@ -272,7 +271,7 @@ def sparse_model(model_dir: Path) -> Model:
     return Model(Surface(xyz, np.zeros((0, 3), np.int64), colors), cameras=cameras)
 
 
-def _frustum(image: pycolmap.Image, camera: pycolmap.Camera) -> PosedPhoto:
+def _frustum(image: pycolmap.Image, camera: Camera) -> PosedPhoto:
     K, pose = scale_matrix(camera), image.cam_from_world().matrix()
     if camera.is_spherical():  # drawn as a view of 90 degrees to its front
         K = camera_matrix(camera.width / 2, camera.width / 2, camera.width / 2, camera.height / 2)
@@ -291,7 +290,7 @@ def read_scene(
     model_dir: Path, names: Mapping[str, str], unregistered: Mapping[str, str], refined: Mapping[str, RefinedCamera]
 ) -> Scene:
     """Read a model on disk as the scene of later stages; `unregistered` has the reason why a photo has no pose."""
-    model = pycolmap.Reconstruction(model_dir)
+    model = Reconstruction(model_dir)
     posed = posed_images(model)
     ids = {names[image.name]: image.camera_id for image in posed}
     return Scene(
@@ -306,7 +305,7 @@ def read_scene(
     )
 
 
-def _camera(camera: pycolmap.Camera, refined: RefinedCamera) -> CameraModel:
+def _camera(camera: Camera, refined: RefinedCamera) -> CameraModel:
     K = scale_matrix(camera)
     params = tuple(float(value) for value in camera.params)
     deviations, determined = finite_entries(refined.get("deviations", {})), tuple(refined.get("determined", ()))
@@ -331,16 +330,16 @@ class ModelFigures:
 
     photos: dict[str, PhotoObservations]
     """By name, of the posed photos."""
-    tracks: NDArray[np.int64]
+    tracks: IndexArray
     """(P,) number of photos that see each point."""
-    places: NDArray[np.float64]
+    places: FloatArray
     """(P, 3) the points."""
 
 
 def model_figures(model_dir: Path) -> ModelFigures:
     """Return the figures of a model on disk."""
     with translate_errors("reading the sparse model"):
-        model = pycolmap.Reconstruction(model_dir)
+        model = Reconstruction(model_dir)
         xyz = {key: np.asarray(point.xyz) for key, point in model.points3D.items()}
         photos = {image.name: _observe(image, model.cameras[image.camera_id], xyz) for image in posed_images(model)}
         keys = [key for key in sorted(xyz) if finite_mask(xyz[key])]
@@ -348,7 +347,7 @@ def model_figures(model_dir: Path) -> ModelFigures:
     return ModelFigures(photos, tracks, np.array([xyz[key] for key in keys]).reshape(-1, 3))
 
 
-def _observe(image: pycolmap.Image, camera: pycolmap.Camera, xyz: dict[int, NDArray[np.float64]]) -> PhotoObservations:
+def _observe(image: pycolmap.Image, camera: Camera, xyz: dict[int, FloatArray]) -> PhotoObservations:
     keypoints = image.get_observation_points2D()
     if not keypoints:
         return PhotoObservations(0, float("nan"), 0.0)

@@ -9,34 +9,25 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.perspective_views import PerspectiveView, center_view
 from sfm_app.camera.rows import FX
-from sfm_app.colmap import tasks
-from sfm_app.colmap.backend import check_written, pycolmap, translate_errors
+from sfm_app.colmap import tasks, wide_views
+from sfm_app.colmap.backend import Reconstruction, check_written, pycolmap, translate_errors
 from sfm_app.colmap.model import finite_points, point_arrays, posed_images
-from sfm_app.colmap.wide_views import (
-    ViewNames,
-    WideLens,
-    make_view_model,
-    parse_view_name,
-    perspective_lenses,
-    render_views,
-)
 from sfm_app.colmap.worker_process import run_worker
 from sfm_app.meshing.agreement import RefinePhoto
 from sfm_app.operating_system import replace_file
 from sfm_app.progress import Progress
 from sfm_app.stereo import View
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import Float32Array, FloatArray
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
 
 
-def full_size_lenses(model: pycolmap.Reconstruction, *, centered: bool) -> dict[int, WideLens]:
+def full_size_lenses(model: Reconstruction, *, centered: bool) -> dict[int, wide_views.WideLens]:
     """Return the views of every camera at full size, by id; `centered` ones have square pixels and a central axis."""
     with translate_errors("undistorting the cameras"):
-        lenses = perspective_lenses(model, 65_000)  # pixels: what JPEG can hold, rounded down
+        lenses = wide_views.perspective_lenses(model, 65_000)  # pixels: what JPEG can hold, rounded down
     if not centered:
         return lenses
     return {key: replace(lens, views=tuple(map(center_view, lens.views))) for key, lens in lenses.items()}
@@ -45,18 +36,18 @@ def full_size_lenses(model: pycolmap.Reconstruction, *, centered: bool) -> dict[
 class PixelMaps:
     """Pixels of a photo that its views show, by camera; those of the last camera are kept for its other photos."""
 
-    def __init__(self, model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens]) -> None:
+    def __init__(self, model: Reconstruction, lenses: Mapping[int, wide_views.WideLens]) -> None:
         self._model, self._lenses, self._lock = model, lenses, threading.Lock()
-        self._known: tuple[int, list[NDArray[np.float32]]] = (-1, [])
+        self._known: tuple[int, list[Float32Array]] = (-1, [])
 
-    def camera_maps(self, camera_id: int) -> list[NDArray[np.float32]]:
+    def camera_maps(self, camera_id: int) -> list[Float32Array]:
         """Return the pixels (H, W, 2) of each view, -1 where the photo does not show them."""
         with self._lock:
             if self._known[0] != camera_id:
                 self._known = camera_id, self._compute(camera_id)
             return self._known[1]
 
-    def _compute(self, camera_id: int) -> list[NDArray[np.float32]]:
+    def _compute(self, camera_id: int) -> list[Float32Array]:
         lens, camera = self._lenses[camera_id], self._model.cameras[camera_id]
 
         def project(rays: FloatArray) -> FloatArray:
@@ -67,7 +58,7 @@ class PixelMaps:
 
 
 def perspective_photos(
-    model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames
+    model: Reconstruction, lenses: Mapping[int, wide_views.WideLens], names: wide_views.ViewNames
 ) -> tuple[PerspectivePhoto, ...]:
     """Return the views of all posed photos, by name of the photo."""
     return tuple(
@@ -78,7 +69,7 @@ def perspective_photos(
 
 
 def write_view_model(
-    model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames, folder: Path, *,
+    model: Reconstruction, lenses: Mapping[int, wide_views.WideLens], names: wide_views.ViewNames, folder: Path, *,
     text: bool = False,
 ) -> None:  # fmt: skip
     """Write COLMAP's model of the views into a new or existing folder, as text or binary."""
@@ -89,12 +80,12 @@ def write_view_model(
 
     folder.mkdir(parents=True, exist_ok=True)
     with translate_errors("writing the model of undistorted photos"):
-        view_model = make_view_model(model, lenses, names, keypoint_rays)
+        view_model = wide_views.make_view_model(model, lenses, names, keypoint_rays)
         view_model.write_text(folder) if text else view_model.write(folder)
     check_written(*folder.iterdir())
 
 
-def all_points(model: pycolmap.Reconstruction) -> PointCloud:
+def all_points(model: Reconstruction) -> PointCloud:
     """Return the finite points of a model, in order of ids."""
     return PointCloud(*point_arrays(finite_points(model)))
 
@@ -107,14 +98,14 @@ class LargerViews:
     ) -> None:
         self._photo_dir, self._mask_dir = photo_dir, mask_dir
         with translate_errors("reading the model"):
-            model = pycolmap.Reconstruction(model_dir)
-            lenses = perspective_lenses(model, max_side_px)
+            model = Reconstruction(model_dir)
+            lenses = wide_views.perspective_lenses(model, max_side_px)
             images = {image.name: image for image in posed_images(model)}
         parts: dict[int, dict[int, PerspectiveView]] = {}
         self._camera, self._poses = dict[str, int](), dict[str, dict[int, View]]()
         for view in views:
             # a single view has the name of its photo
-            name, number = (view.name, 0) if view.name in images else parse_view_name(view.name)
+            name, number = (view.name, 0) if view.name in images else wide_views.parse_view_name(view.name)
             image = images[name]
             R = view.R @ image.cam_from_world().matrix()[:, :3].T
             larger = _resize(view, float(lenses[image.camera_id].params[FX]), max_side_px)
@@ -138,7 +129,7 @@ class LargerViews:
         camera_id, poses = self._camera[photo], self._poses[photo]
         lens, maps = self._lenses[camera_id], self._maps.camera_maps(camera_id)
         with translate_errors(f"reading {photo}"):
-            pictures = render_views(photo, lens, self._photo_dir, self._mask_dir, maps)
+            pictures = wide_views.render_views(photo, lens, self._photo_dir, self._mask_dir, maps)
             for number, (pixels, shown) in zip(self._order[camera_id], pictures, strict=True):
                 if number in poses:
                     gray = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), np.uint8)

@@ -6,27 +6,23 @@ A compensated keypoint is where a global shutter at the time of the middle row w
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.bundle.lens_parts import PARTS
 from sfm_app.bundle.normal_equations import Bundle
 from sfm_app.bundle.rolling_shutter import ReadoutEstimate, Rows, estimate_readout, move_to_middle_row
 from sfm_app.camera.projection import image_points
-from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.backend import Camera, Reconstruction, pycolmap
 from sfm_app.colmap.bundle import Adjustment, lens_priors, read_bundle, write_bundle
 from sfm_app.colmap.model import posed_images, viewing_rays
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import FloatArray, IndexArray
 
 Keypoints = Mapping[int, FloatArray]
 """(N, 2) pixels, by photo id."""
 
 
-def read_keypoints(model: pycolmap.Reconstruction) -> dict[int, FloatArray]:
+def read_keypoints(model: Reconstruction) -> dict[int, FloatArray]:
     """Return the keypoints (N, 2) of all posed photos by id, in pixels."""
-    return {
-        image.image_id: np.array([keypoint.xy for keypoint in image.points2D], np.float64).reshape(-1, 2)
-        for image in posed_images(model)
-    }
+    return {i.image_id: np.array([p.xy for p in i.points2D], np.float64).reshape(-1, 2) for i in posed_images(model)}
 
 
 def measure_readout(
@@ -55,11 +51,9 @@ def measure_readout(
     return estimate_readout(uncompensated, rows, priors, np.array(freed), start, known=known)
 
 
-def straighten_model(
-    model: pycolmap.Reconstruction, estimate: ReadoutEstimate, keypoints: Keypoints
-) -> pycolmap.Reconstruction:
+def straighten_model(model: Reconstruction, estimate: ReadoutEstimate, keypoints: Keypoints) -> Reconstruction:
     """Return a copy of a model with the estimate's poses, points and cameras, and with compensated keypoints."""
-    model = pycolmap.Reconstruction(model)
+    model = Reconstruction(model)
     ids, _ = read_bundle(model)
     write_bundle(model, ids, estimate.bundle)
     for row, image in enumerate(posed_images(model)):
@@ -70,19 +64,19 @@ def straighten_model(
     return model
 
 
-def row_shares(x: FloatArray, camera: pycolmap.Camera) -> FloatArray:
+def row_shares(x: FloatArray, camera: Camera) -> FloatArray:
     """Return the shares (N,) of the rows of keypoints (N, 2); rows are read along the shorter side of the sensor."""
     upright = camera.height > camera.width
     return np.asarray(x[:, 0] / camera.width - 0.5 if upright else x[:, 1] / camera.height - 0.5, np.float64)
 
 
-def _tracked_rows(image: pycolmap.Image) -> NDArray[np.int64]:
+def _tracked_rows(image: pycolmap.Image) -> IndexArray:
     """Return the indices of the keypoints that have a point in space, in order."""
     return np.flatnonzero([keypoint.has_point3D() for keypoint in image.points2D])
 
 
 def _compensate(
-    model: pycolmap.Reconstruction, image: pycolmap.Image, x: FloatArray, estimate: ReadoutEstimate, row: int
+    model: Reconstruction, image: pycolmap.Image, x: FloatArray, estimate: ReadoutEstimate, row: int
 ) -> FloatArray:
     """Return the compensated keypoints (N, 2) of a photo; unchanged if it sees no point."""
     from scipy.spatial import cKDTree

@@ -11,11 +11,12 @@ from sfm_app.colmap import tasks
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.worker_process import run_worker
 from sfm_app.types import Surface
+from sfm_app.types.arrays import ByteArray, FloatArray
 
 FUSED = "fused.ply"
 
 
-def fuse(dense_dir: Path, min_views: int, box: NDArray[np.float64], target: Path, cache_gb: float = 0.0) -> None:
+def fuse(dense_dir: Path, min_views: int, box: FloatArray, target: Path, cache_gb: float = 0.0) -> None:
     """Fuse the geometric maps of a dense workspace, with points within a box (2, 3), into the PLY file `target`.
 
     The cache of maps has `cache_gb`: the less, the more often they are read. 0 holds all, in half the time.
@@ -56,7 +57,7 @@ def _header(fields: np.dtype[np.void], count: int) -> bytes:
     return "\n".join(lines).encode("ascii")
 
 
-def positions(records: NDArray[np.void]) -> NDArray[np.float64]:
+def positions(records: NDArray[np.void]) -> FloatArray:
     """Return the positions (N, 3) of records."""
     return np.stack([records[c] for c in "xyz"], axis=1).astype(np.float64)
 
@@ -78,7 +79,7 @@ def simplify(surface: Surface, most: int, max_error: float, scratch: Path, threa
     return Surface(simple.vertices, simple.faces, _mean_colors(surface, simple.vertices, threads))
 
 
-def _mean_colors(surface: Surface, vertices: NDArray[np.float64], threads: int) -> NDArray[np.uint8]:
+def _mean_colors(surface: Surface, vertices: FloatArray, threads: int) -> ByteArray:
     """Return mean colors (V, 3) of the old vertices nearest to each new vertex (V, 3); pycolmap 4.2 reads no colors."""
     from scipy.spatial import cKDTree
 

@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import check_written, largest_model, pycolmap, run_with_progress
 from sfm_app.colmap.worker_process import ProgressReporter
+from sfm_app.types.arrays import FloatArray
 
 JPEG_QUALITY = 98
 UNDISTORTED_PHOTOS = {"COLMAP": "images", "PMVS": "pmvs/visualize"}
@@ -23,10 +23,7 @@ def map_globally(scratch: Path, photo_dir: Path, seed: int, names: Sequence[str]
 
 
 def global_options(seed: int, names: Sequence[str]) -> pycolmap.GlobalPipelineOptions:
-    """Return COLMAP's defaults, except that it uses our relative poses unchanged and adjusts coarsely.
-
-    The last adjustment is ours.
-    """
+    """Return COLMAP's defaults, except that it uses our relative poses unchanged and adjusts coarsely."""
     options = pycolmap.GlobalPipelineOptions()
     options.image_names = list(names)
     options.min_model_size = 2
@@ -43,10 +40,7 @@ def global_options(seed: int, names: Sequence[str]) -> pycolmap.GlobalPipelineOp
 
 
 def map_with_defaults(scratch: Path, photo_dir: Path, seed: int) -> None:
-    """Verify the raw matches, map them with COLMAP's defaults, and write the largest model into `model`.
-
-    Only seeds and the number of threads differ from the defaults: on several threads, results differ between runs.
-    """
+    """Verify and map raw matches with COLMAP's defaults but seeds and one thread; write the largest model."""
     database = scratch / "database.db"
     geometry = pycolmap.TwoViewGeometryOptions()
     geometry.ransac.random_seed = seed
@@ -98,7 +92,7 @@ def undistort(
 # threads, and where cores are shared they are many times slower.
 
 
-def fuse(dense_dir: Path, min_views: int, box: NDArray[np.float64], target: Path, cache_gb: float) -> None:
+def fuse(dense_dir: Path, min_views: int, box: FloatArray, target: Path, cache_gb: float) -> None:
     """Fuse the depth maps of a dense workspace into points."""
     options = pycolmap.StereoFusionOptions()
     options.min_num_pixels = min_views

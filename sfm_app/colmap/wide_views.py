@@ -6,19 +6,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.perspective_views import PerspectiveView, cover_rays
 from sfm_app.camera.projection import SEEN_ANGLE, image_points
 from sfm_app.camera.rows import FISHEYE, FX, PANORAMA
-from sfm_app.colmap.backend import pycolmap, translate_errors
+from sfm_app.colmap.backend import Camera, Reconstruction, pycolmap, translate_errors
 from sfm_app.colmap.dense import MASKS, shrink_mask
 from sfm_app.colmap.model import camera_family, posed_images, read_camera
 from sfm_app.colmap.tasks import JPEG_QUALITY
 from sfm_app.files import replace_atomically
 from sfm_app.photos.masks import read_mask, save_mask
 from sfm_app.photos.panoramas import resample, shrink
-from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.types.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 
 ViewNames = Mapping[str, Sequence[str]]
 """Names of the views of each photo, by its name."""
@@ -50,19 +49,19 @@ class WideLens:
 def split_wide_photos(model_dir: Path, max_side_px: int) -> dict[int, WideLens] | None:
     """Return the perspective views of every camera, by its id; None if COLMAP's single view is enough for each."""
     with translate_errors("reading the model"):
-        model = pycolmap.Reconstruction(model_dir)
+        model = Reconstruction(model_dir)
         if all(view is not None for view in _single_views(model, max_side_px).values()):
             return None
         return perspective_lenses(model, max_side_px)
 
 
-def perspective_lenses(model: pycolmap.Reconstruction, max_side_px: int) -> dict[int, WideLens]:
+def perspective_lenses(model: Reconstruction, max_side_px: int) -> dict[int, WideLens]:
     """Return the perspective views of every camera with posed photos, by its id; one view where that is enough."""
     single = _single_views(model, max_side_px)
     return {key: _make_lens(model.cameras[key], view, max_side_px) for key, view in single.items()}
 
 
-def _single_views(model: pycolmap.Reconstruction, max_side_px: int) -> dict[int, PerspectiveView | None]:
+def _single_views(model: Reconstruction, max_side_px: int) -> dict[int, PerspectiveView | None]:
     """Return the single view of every camera with posed photos, by its id; None where one loses too much."""
     used = sorted({image.camera_id for image in posed_images(model)})
     return {camera_id: _one_view(model.cameras[camera_id], max_side_px) for camera_id in used}
@@ -82,12 +81,9 @@ def parse_view_name(name: str) -> tuple[str, int]:
 def write_model(model_dir: Path, lenses: Mapping[int, WideLens], dense_dir: Path) -> list[tuple[str, int]]:
     """Write the model of all views into a dense workspace; return the name and the camera's id of each photo."""
     with translate_errors("writing the model of perspective views"):
-        model = pycolmap.Reconstruction(model_dir)
+        model = Reconstruction(model_dir)
         photos = {image.name: image.camera_id for image in sorted(posed_images(model), key=lambda image: image.name)}
-        names = {
-            name: [view_name(name, number) for number in range(len(lenses[camera_id].views))]
-            for name, camera_id in photos.items()
-        }
+        names = {n: [view_name(n, k) for k in range(len(lenses[c].views))] for n, c in photos.items()}
 
         def points_in_camera(image: pycolmap.Image, tracked: Sequence[pycolmap.Point2D]) -> FloatArray:
             pose = image.cam_from_world().matrix()
@@ -100,10 +96,10 @@ def write_model(model_dir: Path, lenses: Mapping[int, WideLens], dense_dir: Path
 
 
 def make_view_model(
-    model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames, rays_of: RaysOfKeypoints
-) -> pycolmap.Reconstruction:
+    model: Reconstruction, lenses: Mapping[int, WideLens], names: ViewNames, rays_of: RaysOfKeypoints
+) -> Reconstruction:
     """Return the model of the views; points keep their ids, and points that no view shows are left out."""
-    view_model = pycolmap.Reconstruction()
+    view_model = Reconstruction()
     cameras = _add_view_cameras(view_model, lenses)
     tracks = {point: pycolmap.Track() for point in sorted(model.points3D)}
     for image in sorted(posed_images(model), key=lambda image: image.name):
@@ -139,8 +135,8 @@ def write_views(name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | Non
 
 
 def render_views(
-    name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | None, maps: Sequence[NDArray[np.float32]] = ()
-) -> Iterator[tuple[NDArray[np.uint8], BoolArray]]:
+    name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | None, maps: Sequence[Float32Array] = ()
+) -> Iterator[tuple[ByteArray, BoolArray]]:
     """Yield each view of a photo, (H, W, 3) BGR, and the mask (H, W) of pixels that it shows and nothing masks.
 
     `maps` (H, W, 2) are the pixels of the photo that each view shows, -1 where it shows none; empty if not known.
@@ -157,13 +153,13 @@ def render_views(
         yield resample(small, pixels, lens.size, wraps=lens.family == PANORAMA), shown
 
 
-def save_picture(target: Path, pixels: NDArray[np.uint8]) -> None:
+def save_picture(target: Path, pixels: ByteArray) -> None:
     """Write a picture (H, W, 3) BGR as JPEG, as a whole or not at all; its folder is created."""
     with replace_atomically(target) as path:
         path.write_bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())
 
 
-def _one_view(camera: pycolmap.Camera, max_side_px: int) -> PerspectiveView | None:
+def _one_view(camera: Camera, max_side_px: int) -> PerspectiveView | None:
     """Return COLMAP's undistorted photo of a camera; None if it loses more than a tenth of the photo."""
     rays = _shown_rays(camera)
     if camera_family(camera) == PANORAMA or not len(rays):
@@ -183,7 +179,7 @@ def _project(rays: FloatArray, view: PerspectiveView) -> tuple[FloatArray, BoolA
     return x, (projected[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1)
 
 
-def _make_lens(camera: pycolmap.Camera, single: PerspectiveView | None, max_side_px: int) -> WideLens:
+def _make_lens(camera: Camera, single: PerspectiveView | None, max_side_px: int) -> WideLens:
     """Return a camera with the views of its photos: the single one, or several."""
     rays, params = _shown_rays(camera), read_camera(camera)
     views = [single] if single is not None else cover_rays(rays, float(params[FX]), max_side_px)
@@ -191,7 +187,7 @@ def _make_lens(camera: pycolmap.Camera, single: PerspectiveView | None, max_side
     return WideLens(params, camera_family(camera), (camera.width, camera.height), least, tuple(views))
 
 
-def _shown_rays(camera: pycolmap.Camera) -> FloatArray:
+def _shown_rays(camera: Camera) -> FloatArray:
     """Return unit vectors (N, 3) of a grid of pixels, without pixels that no ray reaches."""
     grid = 257  # rows and columns of pixels; chosen by hand
     x, y = np.meshgrid(np.linspace(0.0, camera.width, grid), np.linspace(0.0, camera.height, grid))
@@ -208,16 +204,14 @@ def _shown_rays(camera: pycolmap.Camera) -> FloatArray:
     return np.asarray(rays[sound], np.float64)
 
 
-def _add_view_cameras(
-    view_model: pycolmap.Reconstruction, lenses: Mapping[int, WideLens]
-) -> dict[tuple[int, int], int]:
+def _add_view_cameras(view_model: Reconstruction, lenses: Mapping[int, WideLens]) -> dict[tuple[int, int], int]:
     """Add a camera for every view, and return its id by the camera of the photo and the number of the view."""
     ids = dict[tuple[int, int], int]()
     for camera_id, lens in sorted(lenses.items()):
         for number, view in enumerate(lens.views):
             ids[camera_id, number] = len(ids) + 1
             K = view.K
-            camera = pycolmap.Camera(
+            camera = Camera(
                 camera_id=len(ids), model="PINHOLE", width=view.width, height=view.height,
                 params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
             )  # fmt: skip

@@ -99,10 +99,7 @@ class ProcessGroup:
         self._running, self._lock, self._has_ended = set[WorkerProcess](), threading.Lock(), False
 
     def run(self, call: Callable[[], Result], doing: str, progress: Progress) -> Result:
-        """Make a call in a process, which ends with the group, and return its result; errors name what it was `doing`.
-
-        The call shows its progress by a `ProgressReporter`.
-        """
+        """Make a call in a process that ends with the group; return its result; errors name what it was `doing`."""
         with start_worker(call) as process:
             with self._lock:
                 self._running.add(process)

@@ -280,11 +280,7 @@ def spread_reasons(
 
 
 def _limit_workers(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> RunContext:
-    """Announce the cost of these stages, and return the run with as many workers as the memory allows.
-
-    Raises:
-        ConfigError: the photos need more memory than the user allows.
-    """
+    """Announce the cost of stages; return the run with as many workers as the memory allows, ConfigError for none."""
     if not ahead:
         return run
     plan = choose_plan(photos.photos, run.settings, run.workers, run.memory_mb, ahead)
@@ -299,12 +295,7 @@ def _limit_workers(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> R
 
 
 def check_undisturbed(source: Source, photos: PhotoSet | None, run: RunContext, by: Exception | None = None) -> None:
-    """Check that photos and output folder did not change during a stage, which may have failed with an error.
-
-    Raises:
-        InputError: the output folder or a photo is missing or was replaced.
-        OSError: the disk is full, which COLMAP does not always report.
-    """
+    """Raise an InputError if photos or output folder changed during a stage, an OSError if the disk is full."""
     run.workspace.check_exists()
     try:
         if photos is not None:

@@ -3,7 +3,7 @@
 import json
 import logging
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,8 +35,7 @@ from sfm_app.types.camera import EQUIRECTANGULAR
 logger = logging.getLogger("sfm_app")
 
 
-@dataclass(frozen=True, slots=True)
-class CalibratingOptions:
+class OPTIONS:
     """Pairs that calibrate, and inliers through a lens."""
 
     min_radial: float = 0.02
@@ -49,9 +48,6 @@ class CalibratingOptions:
     """Least partners of each photo in a sample of more. Chosen by hand."""
     lens_rounds: int = 2
     """Times that inliers are chosen through the lens so far. Chosen on `benchmarks.lenses.distortion`."""
-
-
-OPTIONS = CalibratingOptions()
 
 
 # Inliers through a lens (ours). A fundamental matrix of pixels keeps the matches that a lens bends least, and cameras
@@ -108,10 +104,7 @@ def find_intrinsics(matches: MatchGraph, views: ViewGraph, run: RunContext) -> I
 
 
 def find_evidence(matches: MatchGraph, run: RunContext, known: Evidence) -> Evidence:
-    """Return the evidence of matches of which some are known: other pairs are fitted, and unknown cameras found.
-
-    Where pairs determine the cameras of half of the photos, more pairs change little.
-    """
+    """Return the evidence of matches of which some are known: other pairs are fitted, and unknown cameras found."""
     same = {pair for pair, rows in matches.matches.items() if known.matches.matches.get(pair) is rows}
     results = known.views.results
     views = find_views(matches, run, known.views.lenses, {pair: results[pair] for pair in same if pair in results})
@@ -204,11 +197,7 @@ def photo_pairs(
     The matrices of the kind `RayFit` are of bearing vectors.
     """
     ids = {image.id for image in images}
-    fits = {
-        pair: fit
-        for pair, fit in views.fits.items()
-        if ids.issuperset(pair) and isinstance(fit, kind) and not fit.degeneracy
-    }
+    fits = {p: f for p, f in views.fits.items() if ids.issuperset(p) and isinstance(f, kind) and not f.degeneracy}
     return PhotoPairs(
         Fs=np.array([fit.matrix for fit in fits.values()], np.float64).reshape(-1, 3, 3),
         weights=pair_weights(np.array([fit.inlier_count for fit in fits.values()], np.int64)),

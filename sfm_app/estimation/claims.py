@@ -90,12 +90,7 @@ def claim(images: Iterable[MatchedImage], found: Calibration) -> Claim | None:
 
 
 def find_priors(matches: MatchGraph, run: RunContext) -> dict[str, CameraPrior]:
-    """Return the claims of a calibration file, else of a plug-in, by name of the photo.
-
-    Raises:
-        InputError: the calibration file fits no photo.
-        PluginError: the plug-in fails, or its claim is no camera.
-    """
+    """Return the claims of a calibration file, else of a plug-in, by photo; InputError or PluginError if unusable."""
     of_file = _priors_of_file(matches, run)
     priors = {one.name: of_file[one.group] for one in matches.images.values() if one.group in of_file}
     method = run.plugins.camera_prior_method(run.settings.calibration.priors)

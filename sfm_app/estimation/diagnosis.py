@@ -23,8 +23,7 @@ NOTHING_MATCHED = ViewGraph({}, {})
 """View graph without matches."""
 
 
-@dataclass(frozen=True, slots=True)
-class DiagnosisOptions:
+class OPTIONS:
     """Limits of a diagnosis."""
 
     max_px_per_feature: float = 800.0
@@ -34,9 +33,6 @@ class DiagnosisOptions:
     """Photos of a plane that determine a parameter of the camera (Triggs 1998): 2 m equations for 4 unknowns."""
     min_parallax: float = 0.01
     """Share of all inliers that must show parallax. Measured: misclassified panoramas 0.2 %, slow videos 15 %."""
-
-
-OPTIONS = DiagnosisOptions()
 
 
 STEP = "take each photo from another place, a step or two from the last"

@@ -33,8 +33,7 @@ METHOD = "lens"
 """Source of a camera: curved epipolar lines."""
 
 
-@dataclass(frozen=True, slots=True)
-class LensOptions:
+class LENS:
     """A fisheye as a camera of COLMAP."""
 
     max_deviation: float = 0.01
@@ -44,8 +43,6 @@ class LensOptions:
     angles: int = 200
     """Angles at which the terms are fitted. Chosen by hand."""
 
-
-LENS = LensOptions()
 
 NONE_KNOWN: Mapping[str, Calibration | None] = MappingProxyType({})
 
@@ -328,11 +325,7 @@ def known_fits(
     groups = {image.group for image in matches.images.values()}
     unchanged = {group for group in groups if _text(before.lenses.get(group)) == _text(lenses.get(group))}
     results = before.results
-    return {
-        pair: results[pair]
-        for pair in same
-        if pair in results and all(matches.images[photo].group in unchanged for photo in pair)
-    }
+    return {p: results[p] for p in same if p in results and all(matches.images[k].group in unchanged for k in p)}
 
 
 def _text(lens: Calibration | None) -> str:

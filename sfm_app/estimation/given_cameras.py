@@ -55,9 +55,7 @@ def assign_cameras(matches: MatchGraph, given: GivenCameras, *, keep: bool) -> A
             cameras[group] = replace(camera, method=KEPT) if keep else camera
             notes += [f"scaled the given camera of the photos {group}: {note}"] if note else []
     if not cameras and rejections:
-        raise InputError(
-            f"{given.source} fits no photo: {rejections[0]}", hint="omit --calibration to estimate the cameras"
-        )
+        raise InputError(f"{given.source} fits no photo: {rejections[0]}", hint="leave --calibration out")
     return AssignedCameras(cameras, (*notes, *rejections))
 
 
@@ -123,8 +121,7 @@ def _choose_name(group: str, images: Sequence[MatchedImage], given: GivenCameras
 # Checks of given cameras against the photos.
 
 
-@dataclass(frozen=True, slots=True)
-class CheckOptions:
+class OPTIONS:
     """When photos contradict a stated camera. Chosen by hand."""
 
     sigmas: float = 3.0
@@ -137,9 +134,6 @@ class CheckOptions:
     """Largest compared angle: the corners hold few matches."""
     angles: int = 20
     """Number of compared angles."""
-
-
-OPTIONS = CheckOptions()
 
 
 CENTERS = ("optical center, across", "optical center, down")
@@ -171,9 +165,7 @@ def report_checks(checked: Mapping[str, tuple[Calibration, Calibration | None]],
     """Announce contradictions, and record all checks: by name the given camera and that of the photos, if any."""
     if not checked:
         return
-    contradictions = {
-        name: find_contradictions(given, estimate) if estimate else [] for name, (given, estimate) in checked.items()
-    }
+    contradictions = {k: find_contradictions(a, b) if b else [] for k, (a, b) in checked.items()}
     for name, contradicted in contradictions.items():
         for one in contradicted:
             run.progress.say(f"beware: the photos contradict the given camera {name}: {one.text}")

@@ -5,7 +5,7 @@ triangles only: points and cameras stay uncompressed.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,14 +15,14 @@ from sfm_app.formats.exporters import check_writable, pages_in_use, split_corner
 from sfm_app.formats.gltf import COMPONENTS, UNLIT, Glb, add_page_material, add_unlit_material, linear_colors, write_glb
 from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Model, Texture
+from sfm_app.types.arrays import FloatArray, IndexArray
 
 DRACO = "KHR_draco_mesh_compression"
 COLOR_ID = 7
 """Draco's number of the attribute with colors; Draco counts its own from 0. By definition."""
 
 
-@dataclass(frozen=True, slots=True)
-class DracoOptions:
+class OPTIONS:
     """Precision of the compressed values."""
 
     position_bits: int = 20
@@ -34,9 +34,6 @@ class DracoOptions:
     """Bits of a texture coordinate: a quarter pixel of the largest page. Chosen by hand."""
     level: int = 7
     """Compression from 0 (fast) to 10 (small); Draco's own tools use 7. By definition."""
-
-
-OPTIONS = DracoOptions()
 
 
 def write_draco(model: Model, name: str) -> Mapping[str, bytes]:
@@ -73,7 +70,7 @@ def _colored_primitive(glb: Glb, model: Model) -> dict[str, Any]:
 
 
 def _compressed_primitive(
-    glb: Glb, vertices: NDArray[np.float64], faces: NDArray[np.int64], arrays: Mapping[str, Any]
+    glb: Glb, vertices: FloatArray, faces: IndexArray, arrays: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Add triangles as Draco's bytes, and return the primitive."""
     import DracoPy

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sfm_app.errors import ReconstructionError
 from sfm_app.types import Model, Scene, Texture
-from sfm_app.types.arrays import IndexArray
+from sfm_app.types.arrays import ByteArray, Float32Array, IndexArray
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
 
 INSTALL_HINT = "pip install 'sfm-app[export]'"
@@ -115,9 +115,7 @@ def missing_package(package: str, module: str) -> str:
 def check_writable(model: Model) -> None:
     """Raise a ReconstructionError for a model without triangles and points, or with coordinates that are not finite."""
     if not len(model.surface.vertices):
-        raise ReconstructionError(
-            "there is nothing to write: the model has no points", hint="take more photos with more overlap"
-        )
+        raise ReconstructionError("the model has no points to write", hint="take more photos with more overlap")
     if not np.isfinite(model.surface.vertices).all():
         raise ReconstructionError("coordinates of the model are not finite", hint="run again from the stage `scene`")
 
@@ -128,7 +126,7 @@ NORMAL_QUALITY, NORMAL_SUFFIX, NORMAL_TYPE = 92, "jpg", "image/jpeg"
 """Quality and type of normal maps: shading is 1.7 degrees off on average (benchmarks/surface/normal_map.py)."""
 
 
-def jpeg(page: NDArray[np.uint8]) -> bytes:
+def jpeg(page: ByteArray) -> bytes:
     """Return a texture page (H, W, 3) as JPEG, without chroma subsampling.
 
     Chroma subsampling smears colors across chart borders. At equal file size, full resolution is closer to the page.
@@ -139,12 +137,12 @@ def jpeg(page: NDArray[np.uint8]) -> bytes:
         return _encode(page, JPEG_QUALITY, optimize=False)
 
 
-def normal_picture(page: NDArray[np.uint8]) -> bytes:
+def normal_picture(page: ByteArray) -> bytes:
     """Return a normal map (H, W, 3) as a file of type `NORMAL_TYPE`."""
     return _encode(page, NORMAL_QUALITY, optimize=False)
 
 
-def _encode(page: NDArray[np.uint8], quality: int, *, optimize: bool) -> bytes:
+def _encode(page: ByteArray, quality: int, *, optimize: bool) -> bytes:
     from PIL import Image
 
     file = io.BytesIO()
@@ -152,7 +150,7 @@ def _encode(page: NDArray[np.uint8], quality: int, *, optimize: bool) -> bytes:
     return file.getvalue()
 
 
-def split_corners(faces: IndexArray, uv: NDArray[np.float32]) -> tuple[IndexArray, NDArray[np.float32], IndexArray]:
+def split_corners(faces: IndexArray, uv: Float32Array) -> tuple[IndexArray, Float32Array, IndexArray]:
     """Divide vertices on chart borders, so that each vertex has one texture coordinate, or C other values.
 
     Returns:

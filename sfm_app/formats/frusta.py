@@ -1,10 +1,9 @@
 """Wire frames of cameras in a scene."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.types import Model, PosedPhoto
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import ByteArray, FloatArray, IndexArray
 
 CAMERA_COLOR = (255, 96, 32)
 """sRGB of the cameras: an orange that walls, trees and skies do not have. By hand."""
@@ -25,7 +24,7 @@ def camera_lines(model: Model) -> tuple[FloatArray, IndexArray]:
     return corners, (starts[:, None, None] + np.array(FRUSTUM_EDGES)).reshape(-1, 2)
 
 
-def camera_dots(model: Model) -> tuple[FloatArray, NDArray[np.uint8]]:
+def camera_dots(model: Model) -> tuple[FloatArray, ByteArray]:
     """Return the cameras of a model as dotted wire frames: points (D, 3) and colors (D, 3)."""
     corners, lines = camera_lines(model)
     share = np.linspace(0.0, 1.0, DOTS, endpoint=False)[:, None, None]
@@ -33,7 +32,7 @@ def camera_dots(model: Model) -> tuple[FloatArray, NDArray[np.uint8]]:
     return dots, camera_colors(len(dots))
 
 
-def camera_colors(count: int) -> NDArray[np.uint8]:
+def camera_colors(count: int) -> ByteArray:
     """Return the color of cameras for `count` vertices."""
     return np.tile(np.array(CAMERA_COLOR, np.uint8), (count, 1))
 
@@ -65,7 +64,7 @@ def scene_size(points: FloatArray) -> float:
     return float(np.linalg.norm(high - low))
 
 
-def append_cameras(model: Model) -> tuple[FloatArray, NDArray[np.uint8], IndexArray]:
+def append_cameras(model: Model) -> tuple[FloatArray, ByteArray, IndexArray]:
     """Return a model's vertices followed by its cameras' corners, their colors, and the cameras' lines."""
     corners, lines = camera_lines(model)
     surface = model.surface

@@ -21,6 +21,7 @@ from sfm_app.formats.exporters import NORMAL_TYPE, check_writable, jpeg, normal_
 from sfm_app.formats.frusta import CAMERA_COLOR, camera_lines, frustum_depth
 from sfm_app.geometry.triangles import corner_tangents, unit_normals
 from sfm_app.types import Model, PosedPhoto, Texture
+from sfm_app.types.arrays import ByteArray, Float32Array, FloatArray, IndexArray
 
 # The container of binary glTF 2.0 (ISO/IEC 12113): a JSON tree, followed by one buffer of arrays.
 
@@ -53,14 +54,14 @@ class Glb:
         self._length += len(padded)
         return view
 
-    def add_vertices(self, values: NDArray[np.float32], *, bounds: bool = False) -> int:
+    def add_vertices(self, values: Float32Array, *, bounds: bool = False) -> int:
         """Add a vertex attribute (N, 2..4) and return the accessor's number; glTF requires bounds for positions."""
         entry = self._accessor(values, VERTICES)
         if bounds:
             entry |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
         return self.add("accessors", entry)
 
-    def add_indices(self, values: NDArray[np.int64], vertices: int) -> int:
+    def add_indices(self, values: IndexArray, vertices: int) -> int:
         """Add indices of so many vertices in the smallest type that fits, and return the accessor's number."""
         small = values.ravel().astype(np.uint16 if vertices <= 0xFFFF else np.uint32)  # 0xFFFF restarts
         return self.add("accessors", self._accessor(small, INDICES))
@@ -96,7 +97,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 """COLMAP's camera looks along +z with y down, glTF's camera along -z with y up."""
 
 
-def opengl_pose(photo: PosedPhoto) -> NDArray[np.float64]:
+def opengl_pose(photo: PosedPhoto) -> FloatArray:
     """Return (4, 4) the pose of a photo, from the axes of glTF's and OpenGL's camera to the world."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = photo.R.T @ FLIP, photo.center
@@ -180,7 +181,7 @@ def add_colored_primitive(glb: Glb, model: Model) -> dict[str, Any]:
     return primitive | {"indices": glb.add_indices(surface.faces, len(surface.vertices))}
 
 
-def add_geometry(glb: Glb, vertices: NDArray[np.float64], normals: NDArray[np.float64] | None) -> dict[str, int]:
+def add_geometry(glb: Glb, vertices: FloatArray, normals: FloatArray | None) -> dict[str, int]:
     """Add positions (V, 3) and unit normals (V, 3) of vertices; return the accessors' numbers by attribute."""
     attributes = {"POSITION": glb.add_vertices(vertices.astype(np.float32), bounds=True)}
     return attributes if normals is None else attributes | {"NORMAL": glb.add_vertices(normals.astype(np.float32))}
@@ -196,7 +197,7 @@ def _matte_material(name: str, **base: Any) -> dict[str, Any]:
     return {"name": name, "doubleSided": True, "pbrMetallicRoughness": rough}
 
 
-def linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
+def linear_colors(colors: ByteArray) -> Float32Array:
     """Return linear light in [0, 1] of 8-bit sRGB colors, same shape (IEC 61966-2-1).
 
     glTF requires linear vertex colors. Values are floats: 8 linear bits show steps in the shadows, and not every reader

@@ -13,6 +13,7 @@ from sfm_app.formats.exporters import FinishedScene, check_writable, normal_file
 from sfm_app.formats.frusta import append_cameras, camera_dots, scene_size
 from sfm_app.geometry.triangles import unit_normals
 from sfm_app.types import Model, Texture
+from sfm_app.types.arrays import FloatArray, IndexArray
 from sfm_app.types.scene import PointCloud
 
 # Binary PLY, the Stanford polygon format, which all programs for point clouds and scanned surfaces open.
@@ -43,7 +44,7 @@ def write_ply(model: Model, name: str) -> Mapping[str, bytes]:
     return {f"{name}.ply": header(elements).encode("ascii") + b"".join(rows.tobytes() for rows in elements.values())}
 
 
-def triangles(faces: NDArray[np.int64]) -> NDArray[np.void]:
+def triangles(faces: IndexArray) -> NDArray[np.void]:
     """Return rows of three vertex indices."""
     rows = np.empty(len(faces), [("count", "u1"), ("vertex_indices", "<i4", 3)])
     rows["count"], rows["vertex_indices"] = 3, faces
@@ -88,10 +89,7 @@ def cloud_ply(cloud: PointCloud) -> bytes:
 
 
 def write_las(scene: FinishedScene, target: Path, *, compressed: bool = False) -> None:
-    """Write the dense cloud as LAS or LAZ with colors, exact to a hundred-millionth of its size; needs laspy.
-
-    It lies on the map, z up, where its place is known.
-    """
+    """Write the dense cloud as LAS or LAZ with colors, exact to a hundred-millionth of its size; needs laspy."""
     import laspy
 
     cloud, wkt = scene.cloud_on_map()
@@ -121,10 +119,7 @@ MATERIAL = "newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum {light}\n"
 
 
 def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
-    """Write triangles with normals and a texture or a color per vertex, or else points; and cameras, if any, as lines.
-
-    The files are the OBJ and, with a texture, the MTL, a JPEG per page, and the normal map, if any.
-    """
+    """Write triangles with texture or colors, else points, and cameras as lines: OBJ, MTL, a JPEG per page."""
     check_writable(model)
     pages = page_files(model, name)
     text = ["# sfm_app\n", *_vertex_lines(model, with_colors=not pages)]
@@ -184,7 +179,7 @@ def format_rows(form: str, values: NDArray[np.generic]) -> str:
     return "".join(form * len(part) % tuple(part.ravel().tolist()) for part in parts)
 
 
-def decimals(vertices: NDArray[np.float64]) -> int:
+def decimals(vertices: FloatArray) -> int:
     """Return the number of decimals that gives `DIGITS` significant digits of the model's size."""
     return max(0, DIGITS - int(np.floor(np.log10(scene_size(vertices) or 1.0))))
 

@@ -5,9 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sfm_app.camera.models import PARAMETERS, projection_of_model, row_of_model
 from sfm_app.camera.rows import K1
 from sfm_app.errors import InputError
@@ -17,6 +14,7 @@ from sfm_app.formats.gltf import opengl_pose
 from sfm_app.formats.meshes import cloud_ply
 from sfm_app.numerical import json_text
 from sfm_app.types import CameraModel, Scene
+from sfm_app.types.arrays import FloatArray
 from sfm_app.types.camera import EQUIRECTANGULAR, FISHEYE
 from sfm_app.types.scene import PerspectivePhoto, camera_center
 
@@ -98,10 +96,7 @@ def write_colmap(
 
 
 def write_bundler(scene: FinishedScene, target: Path) -> None:
-    """Write Bundler's file by COLMAP's own writer, the list of photos, and the photos, into a folder.
-
-    Bundler has one focal length, and takes the optical center for the middle.
-    """
+    """Write Bundler's file by COLMAP's own writer, the list of photos, and the photos, into a folder."""
     views = scene.perspective(centered=True)
     views.write_photos(target)
     views.write_bundle(target / "bundle.out")
@@ -171,11 +166,8 @@ def write_opencv(scene: FinishedScene, target: Path) -> None:
         scene.say(line)
 
 
-def opencv_lens(camera: CameraModel) -> tuple[str, NDArray[np.float64]]:
-    """Return OpenCV's name of the lens, and its coefficients: k1 k2 p1 p2 k3 k4 k5 k6, or four of a fisheye.
-
-    ValueError if OpenCV has no such lens.
-    """
+def opencv_lens(camera: CameraModel) -> tuple[str, FloatArray]:
+    """Return OpenCV's name and coefficients of the lens, 8 or, of a fisheye, 4; ValueError if it has no such lens."""
     projection, terms = projection_of_model(camera.model), row_of_model(camera.model, camera.params)[K1:]
     if projection == EQUIRECTANGULAR:
         raise ValueError("OpenCV has no model of a panorama")
@@ -186,7 +178,7 @@ def opencv_lens(camera: CameraModel) -> tuple[str, NDArray[np.float64]]:
     return "fisheye", terms[[0, 1, 4, 5]]
 
 
-def camera_yaml(name: str, camera: CameraModel, lens: tuple[str, NDArray[np.float64]], scene: Scene) -> str:
+def camera_yaml(name: str, camera: CameraModel, lens: tuple[str, FloatArray], scene: Scene) -> str:
     """Return the file of a camera as cv2.FileStorage writes it; `lens` is from `opencv_lens`."""
     import cv2
 

@@ -29,10 +29,7 @@ FILM_MM = 36.0
 
 
 def write_usd(model: Model, name: str) -> Mapping[str, bytes]:
-    """Write triangles with a texture or a color per vertex, or points; and the cameras, if any.
-
-    The files are the stage in USD's binary form, a JPEG per page of texture, and the normal map, if any.
-    """
+    """Write triangles with a texture or a color per vertex, or points; and the cameras: the stage, a JPEG per page."""
     check_writable(model)
     pages = page_files(model, name)
     with tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch:

@@ -11,7 +11,6 @@ from math import comb
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.errors import InputError
 from sfm_app.files import fingerprint, read_text
@@ -20,7 +19,7 @@ from sfm_app.frame.sighted_points import SightedPoint
 from sfm_app.geometry.poses import Similarity, robust_similarity, umeyama
 from sfm_app.numerical import FAILURES
 from sfm_app.types import ControlPoint, ControlPoints, GpsPosition, MapPlace
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray
 from sfm_app.wording import format_length
 
 # The file, OpenDroneMap's gcp_list.txt.
@@ -216,16 +215,16 @@ class _Placed:
     frame: LocalFrame
     targets: FloatArray
     """(N, 3) positions as x east, y up and z south in the frame, in meters."""
-    used: NDArray[np.bool_]
+    used: BoolArray
     fit: Similarity
     distances: FloatArray
     """(N,) from the targets, in meters."""
 
-    def miss(self, rows: NDArray[np.bool_] | slice = slice(None)) -> float:
+    def miss(self, rows: BoolArray | slice = slice(None)) -> float:
         """Return the root mean square of distances."""
         return float(np.sqrt(np.mean(self.distances[rows] ** 2)))
 
-    def spread(self, rows: NDArray[np.bool_] | slice = slice(None)) -> float:
+    def spread(self, rows: BoolArray | slice = slice(None)) -> float:
         """Return the root mean square of the distances of targets from their middle."""
         return float(np.sqrt(self.targets[rows].var(axis=0).sum()))
 
@@ -248,7 +247,7 @@ def _mark_deviation(sights: Sequence[SightedPoint]) -> float:
     return float(np.sqrt(np.mean([np.trace(one.covariance) / 3 for one in sights])))
 
 
-def agreeing_points(places: FloatArray, targets: FloatArray) -> NDArray[np.bool_]:
+def agreeing_points(places: FloatArray, targets: FloatArray) -> BoolArray:
     """Return which points agree on one similarity; all of fewer than five, which have too little redundancy.
 
     A forward search (Atkinson and Riani 2000) begins with the four that agree best and adds the nearest one by one. The
@@ -303,8 +302,7 @@ def _sigma(distances: FloatArray) -> float:
 # Mistakes that explain why points fit badly, or lie in another place than the photos.
 
 
-@dataclass(frozen=True, slots=True)
-class MistakeOptions:
+class MISTAKES:
     """Constants of the search for mistakes, chosen by hand."""
 
     max_share: float = 0.01
@@ -319,9 +317,6 @@ class MistakeOptions:
     """How far points may lie outside of the area of their system: half a zone of UTM."""
     max_away_m: float = 5000.0
     """How far points may lie from the GPS positions of the photos."""
-
-
-MISTAKES = MistakeOptions()
 
 
 def find_mistake(

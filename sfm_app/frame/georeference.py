@@ -10,15 +10,14 @@ from sfm_app.frame.coordinates import GPS_SYSTEM, LocalFrame, read_system
 from sfm_app.geometry.poses import Similarity, draw_pairs, perpendicular_basis, robust_similarity
 from sfm_app.numerical import FAILURES, MAD_TO_SIGMA
 from sfm_app.types import GpsPosition, Rejected
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray
 from sfm_app.types.photos import FILE
 
 MIN_POSITIONS = 3
 """Least number of distinct positions that must agree."""
 
 
-@dataclass(frozen=True, slots=True)
-class GpsOptions:
+class OPTIONS:
     """Constants of the fit to GPS positions."""
 
     max_residual_m: float = 10.0
@@ -38,9 +37,6 @@ class GpsOptions:
     max_pairs: int = 500
     min_swap_gain: float = 2.0
     """Least factor by which swapping latitude and longitude reduces the residuals of a file that has them swapped."""
-
-
-OPTIONS = GpsOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,10 +158,7 @@ def _fit_on_ground(
     deviation = np.sqrt(unexplained / max(1.0 - unexplained, 1e-12) / (2 * (count - 2)))
     # for positions unrelated to the cameras, `unexplained` has the distribution function u^(n-2): Beta(n - 2, 1)
     if unexplained ** (count - 2) > OPTIONS.significance or deviation > OPTIONS.max_scale_deviation:
-        return Rejected(
-            f"{used} GPS positions with a spread of {extent:.0f} m and residuals of {rms:.1f} m "
-            "do not determine a scale"
-        )
+        return Rejected(f"{used} GPS positions of {extent:.0f} m with errors of {rms:.1f} m do not determine a scale")
     scale = float(np.abs(a))
     c = a / scale
     R = np.array([[c.real, -c.imag, 0.0], [c.imag, c.real, 0.0], [0.0, 0.0, 1.0]]) @ np.stack([*axes, up])
@@ -174,7 +167,7 @@ def _fit_on_ground(
     return Georeference(fit, _median_position(given), used, len(places), rms, float(deviation))
 
 
-def _inlier_mask(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float) -> NDArray[np.bool_]:
+def _inlier_mask(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float) -> BoolArray:
     """Find the inliers of the best pair by truncated squared residuals, then refit until they no longer change."""
     best, least = np.ones(len(z), bool), np.inf
     for pair in draw_pairs(len(z), OPTIONS.max_pairs):

@@ -5,19 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm_app.frame import sighted_points
 from sfm_app.frame.markers import find_markers_in_file, marker_scales
 from sfm_app.frame.scale import ScaleEvidence
-from sfm_app.frame.sighted_points import (
-    PosedPhotos,
-    Sight,
-    SightedPoint,
-    Sightlines,
-    layout_scale,
-    locate_point,
-    measure_distance,
-    named_photos,
-    unrotate_pixels,
-)
 from sfm_app.runtime.context import RunContext
 from sfm_app.tasks import Task
 from sfm_app.types import ControlPoints, PhotoSet
@@ -27,18 +17,20 @@ TAPE_DEVIATION = 0.002
 """Relative standard deviation of a distance measured by hand: two millimeters per meter. Chosen by hand."""
 
 
-def distance_evidence(distances: Sequence[tuple[str, str, str]], model: Sightlines) -> list[ScaleEvidence]:
+def distance_evidence(
+    distances: Sequence[tuple[str, str, str]], model: sighted_points.Sightlines
+) -> list[ScaleEvidence]:
     """Return the scale by each known distance: two points of the model and a length, as in the settings."""
     evidence = []
     for first, second, length in distances:
         a, b, meters = np.array(parse_point(first)), np.array(parse_point(second)), parse_length(length)
-        distance = measure_distance(a, b, model, 1.0, None)
+        distance = sighted_points.measure_distance(a, b, model, 1.0, None)
         deviation = float(np.hypot(distance.deviation / distance.value, TAPE_DEVIATION))
         evidence.append(ScaleEvidence(f"the distance of {format_length(meters)}", meters / distance.value, deviation))
     return evidence
 
 
-def marker_evidence(posed: PosedPhotos, run: RunContext, problems: list[str]) -> list[ScaleEvidence]:
+def marker_evidence(posed: sighted_points.PosedPhotos, run: RunContext, problems: list[str]) -> list[ScaleEvidence]:
     """Return the scale by each printed marker, and add unusable markers to the problems."""
     options = run.settings.scale
     names = sorted(posed.names)
@@ -60,40 +52,40 @@ def is_normalized(given: ControlPoints) -> bool:
 
 def marks_in_pixels(photos: PhotoSet, given: ControlPoints) -> ControlPoints:
     """Return points whose marks are shares of width and height with marks in pixels of the upright photos."""
-    names, points = named_photos(photos.photos), []
+    names, points = sighted_points.named_photos(photos.photos), []
     for point in given.points:
         marks = {}
         for name in point.marks.keys() & names.keys():
             photo, mark = names[name], point.marks[name]
             size = (photo.height, photo.width) if photo.turn_deg % 180 else (photo.width, photo.height)
-            scale = layout_scale(photo, photos.folder)
+            scale = sighted_points.layout_scale(photo, photos.folder)
             marks[name] = (mark[0] * size[0] / scale, mark[1] * size[1] / scale)
         points.append(replace(point, marks=marks))
     return replace(given, points=tuple(points))
 
 
 def control_places(
-    photos: PhotoSet, posed: PosedPhotos, given: ControlPoints, problems: list[str]
-) -> dict[str, SightedPoint]:
+    photos: PhotoSet, posed: sighted_points.PosedPhotos, given: ControlPoints, problems: list[str]
+) -> dict[str, sighted_points.SightedPoint]:
     """Return the place in the model of each ground control point that its marks determine, and add problems."""
-    names, located = named_photos(photos.photos), dict[str, SightedPoint]()
+    names, located = sighted_points.named_photos(photos.photos), dict[str, sighted_points.SightedPoint]()
     unknown = sorted({photo for point in given.points for photo in point.marks if photo not in names})
     if unknown:
         problems.append(f"no photo in use is called {list_names(unknown, 5)}")
     marked = {photo for point in given.points for photo in point.marks if photo in names}
-    scales = {name: layout_scale(names[name], photos.folder) for name in sorted(marked)}
+    scales = {name: sighted_points.layout_scale(names[name], photos.folder) for name in sorted(marked)}
     for point in given.points:
-        sights: list[Sight] = []
+        sights: list[sighted_points.Sight] = []
         for name, mark in point.marks.items():
             photo = names.get(name)
             if photo is None or photo.name not in posed:
                 continue
-            pixel = unrotate_pixels(photo, scales[name] * np.array([mark]))
+            pixel = sighted_points.unrotate_pixels(photo, scales[name] * np.array([mark]))
             if not (0 <= pixel[0, 0] <= photo.width and 0 <= pixel[0, 1] <= photo.height):
                 problems.append(f"ground control point '{point.name}': its mark in {name} lies outside of the photo")
                 continue
             sights += posed.sights(photo.name, pixel)
-        place = locate_point(sights)
+        place = sighted_points.locate_point(sights)
         if isinstance(place, str):
             problems.append(f"ground control point '{point.name}' is not used: {place}")
             continue

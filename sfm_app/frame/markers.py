@@ -9,7 +9,6 @@ from types import MappingProxyType
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.errors import ConfigError, InputError
@@ -18,7 +17,7 @@ from sfm_app.frame.scale import ScaleEvidence
 from sfm_app.frame.sighted_points import Sight, SightedPoint, locate_point
 from sfm_app.geometry.poses import umeyama
 from sfm_app.numerical import MAD_TO_SIGMA
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, ByteArray, FloatArray
 from sfm_app.wording import format_length
 
 AUTO = "auto"
@@ -36,8 +35,7 @@ UNKNOWNS = 9
 """Eight of a homography, and the shift of all edges towards their dark side. By definition."""
 
 
-@dataclass(frozen=True, slots=True)
-class MarkerOptions:
+class OPTIONS:
     """Constants of the fit of patterns to photos."""
 
     along: tuple[float, ...] = (0.25, 0.5, 0.75)
@@ -60,15 +58,13 @@ class MarkerOptions:
     places, is off by a side or more."""
 
 
-OPTIONS = MarkerOptions()
-
 # Corners, to a few hundredths of a pixel by all edges of the pattern.
 # Detectors look for the outer contour. Blur and the camera's tone curve move every edge towards its dark side, so that
 # a contour is half a pixel too small: 1 % of a marker of 50 pixels. A pattern has edges with the dark side on either
 # side and above and below, which separate this shift from the size.
 
 
-def fit_pattern(gray: NDArray[np.uint8], pattern: NDArray[np.uint8], corners: FloatArray) -> FloatArray | None:
+def fit_pattern(gray: ByteArray, pattern: ByteArray, corners: FloatArray) -> FloatArray | None:
     """Return the corners (4, 2) of a pattern in a photo (H, W), by all edges of the pattern; None if too few agree.
 
     The cells (N, N) with the dark border are 0 or 255. The given corners are exact to a pixel or two, clockwise from
@@ -98,7 +94,7 @@ def fit_pattern(gray: NDArray[np.uint8], pattern: NDArray[np.uint8], corners: Fl
     return corners
 
 
-def edge_sides(pattern: NDArray[np.uint8]) -> tuple[FloatArray, FloatArray]:
+def edge_sides(pattern: ByteArray) -> tuple[FloatArray, FloatArray]:
     """Return points (E, 2), x and y in cells, in the light and the dark cells beside each edge of a pattern (N, N)."""
     lit = np.pad(pattern > 127, 1, constant_values=True)
     light, dark = [], []
@@ -115,7 +111,7 @@ def edge_sides(pattern: NDArray[np.uint8]) -> tuple[FloatArray, FloatArray]:
     return np.array(light).reshape(-1, 2), np.array(dark).reshape(-1, 2)
 
 
-def _crossings(gray: NDArray[np.uint8], light: FloatArray, dark: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _crossings(gray: ByteArray, light: FloatArray, dark: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return points (E, 2) where profiles cross their middle gray level, NaN without one, and the contrast (E,)."""
     along = np.linspace(0.0, 1.0, OPTIONS.steps)
     places = (light[:, None] + along[None, :, None] * (dark - light)[:, None]).astype(np.float32) - np.float32(0.5)
@@ -196,7 +192,7 @@ def find_markers_in_file(photo_dir: Path, family: str, name: str) -> list[Detect
     return find_markers(gray, TRIED if family == AUTO else (family,))
 
 
-def find_markers(gray: NDArray[np.uint8], families: Sequence[str]) -> list[DetectedMarker]:
+def find_markers(gray: ByteArray, families: Sequence[str]) -> list[DetectedMarker]:
     """Return the markers of some families in a photo (H, W), with corners from all edges of their patterns."""
     options = cv2.aruco.DetectorParameters()
     options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -217,7 +213,7 @@ def load_dictionary(family: str) -> cv2.aruco.Dictionary:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, FAMILIES[family]))
 
 
-def draw_pattern(family: str, number: int) -> NDArray[np.uint8]:
+def draw_pattern(family: str, number: int) -> ByteArray:
     """Return the (N, N) cells of a marker with its dark border, 0 or 255."""
     dictionary = load_dictionary(family)
     return np.asarray(cv2.aruco.generateImageMarker(dictionary, number, dictionary.markerSize + 2), np.uint8)
@@ -227,8 +223,7 @@ PAGES_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)
 """Width and height of a sheet of paper, by its name."""
 
 
-@dataclass(frozen=True, slots=True)
-class PageOptions:
+class PAGE:
     """Layout of a page of markers."""
 
     margin_mm: float = 10.0
@@ -237,9 +232,6 @@ class PageOptions:
     ruler_mm: float = 100.0
     """Length of the ruler to check the printer by."""
     max_markers: int = 12
-
-
-PAGE = PageOptions()
 
 
 def write_marker_page(
@@ -256,9 +248,7 @@ def write_marker_page(
     places = places[: max(min(PAGE.max_markers, count - first), 0)]
     if not places:
         size = format_length(side_m)
-        raise ConfigError(
-            f"no marker of {size} fits on {paper}, or none has number {first}", hint="choose smaller ones"
-        )
+        raise ConfigError(f"no marker of {size} fits on {paper}, or none has number {first}", hint="choose others")
     data = _draw(places, side_m * 1000.0, family, first, paper, path.suffix.lower().removeprefix("."))
     try:
         with replace_atomically(path) as target:
@@ -306,7 +296,7 @@ def _draw(places: list[tuple[float, float]], side: float, family: str, first: in
     return file.getvalue()
 
 
-def _dark_bars(pattern: NDArray[np.uint8], x: float, y: float, side: float) -> list[FloatArray]:
+def _dark_bars(pattern: ByteArray, x: float, y: float, side: float) -> list[FloatArray]:
     """Return x and y of the dark bars, alternating, for `Axes.fill`; rows and columns cover each other's seams."""
     cells = len(pattern)
     bars = [(row, row + 1, *bar) for row in range(cells) for bar in _runs(pattern[row] < 128)]
@@ -318,7 +308,7 @@ def _dark_bars(pattern: NDArray[np.uint8], x: float, y: float, side: float) -> l
     return outlines
 
 
-def _runs(dark: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _runs(dark: BoolArray) -> list[tuple[int, int]]:
     steps = np.diff(np.concatenate([[0], dark.astype(np.int8), [0]]))
     return list(zip(np.flatnonzero(steps > 0).tolist(), np.flatnonzero(steps < 0).tolist(), strict=True))
 

@@ -38,11 +38,7 @@ TITLES = re.compile(
 
 
 def read_positions(path: Path, files: Collection[str]) -> tuple[dict[str, GpsPosition], list[str]]:
-    """Read the positions of photos; an InputError names a malformed line.
-
-    `files` are those of the folder of photos, with forward slashes; positions have these names. Also return the photos
-    that the folder does not have.
-    """
+    """Return positions by file of the folder, and photos that it lacks; an InputError names a malformed line."""
     try:
         lines = [(number, line.strip()) for number, line in enumerate(read_text(path, MOST_BYTES).splitlines(), 1)]
         titles = TITLES.match(lines[0][1]) if lines else None

@@ -6,18 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.colmap.backend import Reconstruction, translate_errors
 from sfm_app.colmap.model import focal_px, posed_images, seen_points, viewing_rays
 from sfm_app.geometry.poses import draw_pairs
 from sfm_app.types import Photo
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 
-@dataclass(frozen=True, slots=True)
-class SightOptions:
+class OPTIONS:
     """Constants of points in the model, by their marks in photos."""
 
     max_residual_px: float = 6.0
@@ -36,9 +34,6 @@ class SightOptions:
     """Least standard deviation of a place picked on a surface. Chosen by hand."""
     max_points: int = 200_000
     """Largest number of points of a model among which the nearest to a place are sought."""
-
-
-OPTIONS = SightOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +96,7 @@ def ray_information(place: FloatArray, centers: FloatArray, rays: FloatArray, fo
     return np.asarray((weights[:, None, None] * across).sum(axis=0))
 
 
-def _inliers_of_pairs(centers: FloatArray, rays: FloatArray, focals: FloatArray) -> NDArray[np.bool_] | None:
+def _inliers_of_pairs(centers: FloatArray, rays: FloatArray, focals: FloatArray) -> BoolArray | None:
     """Return the inliers (N,) of the best pair of rays; None if no pair meets in front of its cameras."""
     best, least = None, np.inf
     for pair in draw_pairs(len(rays), OPTIONS.max_pairs):
@@ -163,7 +158,7 @@ class Sightlines:
     """(C,) pixels per radian."""
     points: FloatArray
     """(P, 3)."""
-    seen_by: tuple[NDArray[np.int64], ...]
+    seen_by: tuple[IndexArray, ...]
     """For each point, the indices of the cameras that see it."""
     residual_px: float
     """Mean reprojection error."""

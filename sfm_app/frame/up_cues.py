@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.poses import component_along, normalize, smallest_eigenvector
 from sfm_app.numerical import MAD_TO_SIGMA
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IndexArray
 
 # The up direction from how photographers hold cameras.
 # Most hold them level: the x axes of the cameras are horizontal, and up is the direction most nearly perpendicular
@@ -207,7 +207,7 @@ class Surfaces:
 
 
 def fit_surfaces(
-    points: FloatArray, brightness: FloatArray, visible: Sequence[NDArray[np.int64]], centers: FloatArray
+    points: FloatArray, brightness: FloatArray, visible: Sequence[IndexArray], centers: FloatArray
 ) -> Surfaces:
     """Fit a plane to the neighbors of each of P points (P, 3) in the world, and keep flat patches.
 
@@ -233,7 +233,7 @@ def fit_surfaces(
 
 
 def depth_height_correlation(
-    up: FloatArray, rotations: FloatArray, centers: FloatArray, points: FloatArray, visible: Sequence[NDArray[np.int64]]
+    up: FloatArray, rotations: FloatArray, centers: FloatArray, points: FloatArray, visible: Sequence[IndexArray]
 ) -> float:
     """Return the mean correlation of log depth with height in the photo, in [-1, 1].
 
@@ -269,7 +269,7 @@ def brightness_normal_correlation(up: FloatArray, surfaces: Surfaces) -> float:
     return float((rise * shade).mean() / (spreads[0] * spreads[1])) if min(spreads) > CUE_OPTIONS.min_rms else 0.0
 
 
-def slope_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
+def slope_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[ByteArray | None]) -> float:
     """Return the mean share of rising minus falling brightness slopes along `up`, by power, in [-1, 1].
 
     Shadow under ledges, eaves and objects has a sharp border to the lit top above it, and skylines are brighter above;
@@ -284,7 +284,7 @@ def slope_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[ND
     return _mean(shares)
 
 
-def sky_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
+def sky_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[ByteArray | None]) -> float:
     """Return the mean share of even, bright pixels near the upper border minus the lower, in [-1, 1].
 
     Arguments as in `slope_asymmetry`.
@@ -304,8 +304,8 @@ def sky_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDAr
 
 
 def _blurred(
-    rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None], blur_px: float
-) -> Iterator[tuple[FloatArray, NDArray[np.float32]]]:
+    rotations: FloatArray, pictures: Sequence[ByteArray | None], blur_px: float
+) -> Iterator[tuple[FloatArray, Float32Array]]:
     """Yield the rotation and the blurred gray levels of each photo that has a picture."""
     for R, picture in zip(rotations, pictures, strict=True):
         if picture is not None and min(picture.shape) >= 3:
@@ -316,14 +316,14 @@ def _mean(values: list[float]) -> float:
     return float(np.mean(values)) if values else 0.0
 
 
-def _black_background(gray: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _black_background(gray: Float32Array) -> BoolArray:
     widths = CUE_OPTIONS.black_px, 2 * CUE_OPTIONS.border_px + 1
     broad, border = (np.ones((width, width), np.uint8) for width in widths)
     black = cv2.morphologyEx((gray < CUE_OPTIONS.black).astype(np.uint8), cv2.MORPH_OPEN, broad)
     return np.asarray(cv2.dilate(black, border) > 0)
 
 
-def _slope(gray: NDArray[np.float32], axis: FloatArray) -> NDArray[np.float32]:
+def _slope(gray: Float32Array, axis: FloatArray) -> Float32Array:
     """Return the derivative (H - 2, W - 2) along an axis (x, y, ...) of the picture, in gray levels per pixel."""
     down, right = gray[2:, 1:-1] - gray[:-2, 1:-1], gray[1:-1, 2:] - gray[1:-1, :-2]
     return np.asarray(0.5 * (axis[0] * right + axis[1] * down), np.float32)

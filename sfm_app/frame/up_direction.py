@@ -9,36 +9,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfm_app.frame.up_cues import (
-    Roll,
-    brightness_normal_correlation,
-    depth_height_correlation,
-    fit_surfaces,
-    mean_upward_normal,
-    roll_hypotheses,
-    sky_asymmetry,
-    slope_asymmetry,
-)
+from sfm_app.frame import up_cues
 from sfm_app.frame.vanishing_points import Segments, find_vanishing_direction, fit_orthogonal_frame, level_direction
-from sfm_app.geometry.poses import (
-    Similarity,
-    axis_angle_deg,
-    component_along,
-    normalize,
-    perpendicular_basis,
-    perpendicular_component,
-    smallest_eigenvector,
-)
-from sfm_app.types.arrays import FloatArray
+from sfm_app.geometry import poses
+from sfm_app.types.arrays import ByteArray, FloatArray, IndexArray
 
 LINES, ROLL, GROUND, GPS = "vanishing lines", "camera roll", "ground plane", "GPS"
 WALL, CAMERAS = "wall", "cameras"
 
 
-@dataclass(frozen=True, slots=True)
-class UpOptions:
+class OPTIONS:
     """Constants of the up direction and of the frame of viewers."""
 
     samples: int = 1000
@@ -67,9 +48,6 @@ class UpOptions:
     """Quantiles of the points with the middle of the scene halfway between them."""
 
 
-OPTIONS = UpOptions()
-
-
 def dominant_plane(
     points: FloatArray, axis: FloatArray, between_deg: tuple[float, float]
 ) -> tuple[FloatArray, float] | None:
@@ -87,10 +65,10 @@ def dominant_plane(
     best, most = None, OPTIONS.min_share * len(cloud)
     for triple in rng.integers(0, len(cloud), (OPTIONS.samples, 3)):
         a, b, c = cloud[triple]
-        normal = normalize(np.cross(b - a, c - a))
-        if not normal.any() or not between_deg[0] <= axis_angle_deg(normal, axis) <= between_deg[1]:
+        normal = poses.normalize(np.cross(b - a, c - a))
+        if not normal.any() or not between_deg[0] <= poses.axis_angle_deg(normal, axis) <= between_deg[1]:
             continue
-        near = np.abs(component_along(cloud - a, normal)) < reach
+        near = np.abs(poses.component_along(cloud - a, normal)) < reach
         if np.count_nonzero(near) > most:
             best, most = near, float(np.count_nonzero(near))
     return None if best is None else _fit_plane(cloud[best], axis)
@@ -102,7 +80,7 @@ def _fit_plane(points: FloatArray, axis: FloatArray) -> tuple[FloatArray, float]
     small, middle, _ = np.linalg.eigvalsh(scatter)
     # rounding may leave the least eigenvalue of coplanar points below zero
     deviation = np.degrees(np.arctan2(np.sqrt(max(small, 0.0) / len(points)), np.sqrt(max(middle, 1e-30))))
-    return smallest_eigenvector(scatter, axis), float(deviation)
+    return poses.smallest_eigenvector(scatter, axis), float(deviation)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,9 +118,9 @@ class Scenery:
     """(P, 3)"""
     brightness: FloatArray
     """(P,) 0 to 255."""
-    visible: tuple[NDArray[np.int64], ...]
+    visible: tuple[IndexArray, ...]
     """Per photo, the indices of its visible points."""
-    pictures: tuple[NDArray[np.uint8] | None, ...]
+    pictures: tuple[ByteArray | None, ...]
     """Per photo its small gray picture, or None."""
 
 
@@ -158,7 +136,7 @@ class UpEstimate:
     """Source of `up`: `LINES`, `ROLL`, `GROUND` or `GPS`."""
     deviation_deg: float
     """Standard deviation of `up`, from its evidence."""
-    roll: Roll
+    roll: up_cues.Roll
     """Up from the cameras alone, for the chosen turn of the photos."""
     evidence: Mapping[str, float]
     """Log odds of up against down by cue, in nats; negative for a contradicting cue."""
@@ -170,7 +148,7 @@ class UpEstimate:
     @property
     def angle_to_roll_deg(self) -> float:
         """Angle between `up` and up from the cameras alone, in degrees."""
-        return float(axis_angle_deg(self.up, self.roll.up))
+        return float(poses.axis_angle_deg(self.up, self.roll.up))
 
     def with_up(self, up: FloatArray, deviation_deg: float) -> "UpEstimate":
         """Return a copy with up from GPS, a unit vector (3,) in the world whose sign is certain."""
@@ -178,10 +156,12 @@ class UpEstimate:
         return replace(sure, up=up, level=None, method=GPS, deviation_deg=deviation_deg)
 
 
-def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArray, scenery: Scenery) -> UpEstimate:
+def select_roll(
+    rolls: Sequence[up_cues.Roll], rotations: FloatArray, centers: FloatArray, scenery: Scenery
+) -> UpEstimate:
     """Choose the vertical by roll and ledges, then its upper end by all cues; the rolls are in order of their turns."""
-    surfaces = fit_surfaces(scenery.points, scenery.brightness, scenery.visible, centers)
-    ledges = [slope_asymmetry(roll.up, rotations, scenery.pictures) for roll in rolls[:2]]
+    surfaces = up_cues.fit_surfaces(scenery.points, scenery.brightness, scenery.visible, centers)
+    ledges = [up_cues.slope_asymmetry(roll.up, rotations, scenery.pictures) for roll in rolls[:2]]
     upright, lying = (
         float(np.logaddexp(-roll.cost, -opposite.cost)) for roll, opposite in zip(rolls[:2], rolls[2:], strict=True)
     )
@@ -190,11 +170,11 @@ def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArra
     chosen = 0 if gap >= 0 else 1
     up, down = rolls[chosen], rolls[chosen + 2]
     values = {
-        "low is near": depth_height_correlation(up.up, rotations, centers, scenery.points, scenery.visible),
-        "tops are seen": mean_upward_normal(up.up, surfaces),
-        "tops are bright": brightness_normal_correlation(up.up, surfaces),
+        "low is near": up_cues.depth_height_correlation(up.up, rotations, centers, scenery.points, scenery.visible),
+        "tops are seen": up_cues.mean_upward_normal(up.up, surfaces),
+        "tops are bright": up_cues.brightness_normal_correlation(up.up, surfaces),
         "ledges are lit": ledges[chosen],
-        "sky is above": sky_asymmetry(up.up, rotations, scenery.pictures),
+        "sky is above": up_cues.sky_asymmetry(up.up, rotations, scenery.pictures),
     }
     evidence = {name: CUES[name].nats(value, len(surfaces.normals)) for name, value in values.items()}
     for_up = down.cost - up.cost + sum(evidence.values())
@@ -212,7 +192,7 @@ def up_direction(
     rotations: FloatArray, centers: FloatArray, scenery: Scenery, segments: Segments, turn_deg: int | None = None
 ) -> UpEstimate:
     """Find up from vertical lines near that of the cameras' roll, or else from the ground or the roll."""
-    rolls = roll_hypotheses(rotations, centers)
+    rolls = up_cues.roll_hypotheses(rotations, centers)
     if turn_deg is None:
         upright = select_roll(rolls, rotations, centers, scenery)
     else:
@@ -227,7 +207,7 @@ def up_direction(
             return replace(upright, up=vertical, method=LINES, deviation_deg=deviation_deg)
         frame, deviation_deg = fit_orthogonal_frame(vertical, level, segments)
         # verticals alone and all edges together have different errors; their angle measures both
-        gap_deg = float(axis_angle_deg(frame[0], vertical))
+        gap_deg = float(poses.axis_angle_deg(frame[0], vertical))
         deviation_deg = float(np.hypot(deviation_deg, gap_deg))
         return replace(upright, up=frame[0], level=frame[1], method=LINES, deviation_deg=deviation_deg)
     if roll.spread_deg > OPTIONS.unsure_deg:
@@ -240,12 +220,12 @@ def up_direction(
 def viewer_direction(upright: UpEstimate, rotations: FloatArray, points: FloatArray) -> tuple[FloatArray, str]:
     """Choose the horizontal direction (3,) to the cameras, or of lines or walls near it, and name its source."""
     up = upright.up
-    towards = normalize(perpendicular_component(-rotations[:, 2].mean(axis=0), up))
+    towards = poses.normalize(poses.perpendicular_component(-rotations[:, 2].mean(axis=0), up))
     if not towards.any():
-        towards = perpendicular_basis(up)[0]
+        towards = poses.perpendicular_basis(up)[0]
     axis, source = upright.level, LINES
     if axis is None and (wall := dominant_plane(points, up, OPTIONS.wall_deg)) is not None:
-        axis, source = normalize(perpendicular_component(wall[0], up)), WALL
+        axis, source = poses.normalize(poses.perpendicular_component(wall[0], up)), WALL
     if axis is None:
         return towards, CAMERAS
     sides = np.stack([axis, np.cross(up, axis), -axis, np.cross(axis, up)])
@@ -254,7 +234,9 @@ def viewer_direction(upright: UpEstimate, rotations: FloatArray, points: FloatAr
     return (np.asarray(nearest), source) if square else (towards, CAMERAS)
 
 
-def viewer_frame(up: FloatArray, towards: FloatArray, points: FloatArray, meters: float | None = None) -> Similarity:
+def viewer_frame(
+    up: FloatArray, towards: FloatArray, points: FloatArray, meters: float | None = None
+) -> poses.Similarity:
     """Return the similarity into the frame of glTF viewers: y up, z to the viewer, the points around the origin.
 
     `up` and `towards` are perpendicular unit vectors (3,), `meters` those of a unit of the world; if None, four of five
@@ -266,4 +248,4 @@ def viewer_frame(up: FloatArray, towards: FloatArray, points: FloatArray, meters
     center = np.mean(np.quantile(rotated, OPTIONS.quantiles, axis=0), axis=0)
     size = float(np.percentile(np.linalg.norm(rotated - center, axis=1), 80))
     scale = 1.0 / max(size, 1e-12) if meters is None else meters
-    return Similarity(scale, R, -scale * center)
+    return poses.Similarity(scale, R, -scale * center)

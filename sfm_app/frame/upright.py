@@ -8,7 +8,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import Reconstruction, translate_errors
 from sfm_app.colmap.model import (
@@ -30,7 +29,7 @@ from sfm_app.geometry.poses import Similarity
 from sfm_app.numerical import FAILURES, Json, error_reason
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import GpsPosition, MapPlace, MatchGraph, Rejected
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import ByteArray, FloatArray
 
 logger = logging.getLogger("sfm_app")
 
@@ -41,7 +40,7 @@ class PhotoCues:
 
     lines: FloatArray
     """(N, 4) line segments in pixels of the photo."""
-    picture: NDArray[np.uint8] | None
+    picture: ByteArray | None
     """The photo, gray and small; None if OpenCV cannot read it."""
 
 
@@ -103,7 +102,17 @@ def orient(
         raise NumericalError("the frame of the viewer is not finite")
     with translate_errors("turning the model upright"):
         move(model, viewer)
-    entry = _orientation_entry(upright, front) | _georeference_entry(viewer, gps)
+    entry = {
+        "up": upright.method,
+        "up_deviation_deg": round(upright.deviation_deg, 3) if np.isfinite(upright.deviation_deg) else None,
+        "off_camera_roll_deg": round(upright.angle_to_roll_deg, 2),
+        "camera_roll_spread_deg": round(upright.roll.spread_deg, 2),
+        "photos_turned_deg": upright.roll.turn_deg,
+        "up_sign_odds": odds(upright.sign_log_odds),
+        "up_axis_odds": odds(upright.axis_log_odds),
+        "up_evidence_nats": {name: round(nats, 1) for name, nats in upright.evidence.items()},
+        "front": front,
+    } | _georeference_entry(viewer, gps)
     logger.info("orientation: %s", entry)
     return entry
 
@@ -160,20 +169,6 @@ def extract_cues(path: Path, turn_deg: int = 0) -> PhotoCues:
         return PhotoCues(np.zeros((0, 4)), None)
     gray = np.asarray(picture, np.uint8)
     return PhotoCues(line_segments(gray), np.rot90(shrink(gray, CUE_OPTIONS.picture_px), -turn_deg // 90))
-
-
-def _orientation_entry(upright: UpEstimate, front: str) -> dict[str, Json]:
-    return {
-        "up": upright.method,
-        "up_deviation_deg": round(upright.deviation_deg, 3) if np.isfinite(upright.deviation_deg) else None,
-        "off_camera_roll_deg": round(upright.angle_to_roll_deg, 2),
-        "camera_roll_spread_deg": round(upright.roll.spread_deg, 2),
-        "photos_turned_deg": upright.roll.turn_deg,
-        "up_sign_odds": odds(upright.sign_log_odds),
-        "up_axis_odds": odds(upright.axis_log_odds),
-        "up_evidence_nats": {name: round(nats, 1) for name, nats in upright.evidence.items()},
-        "front": front,
-    }
 
 
 def gps_deviation(orientation: Mapping[str, Json]) -> float | None:

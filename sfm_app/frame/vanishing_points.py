@@ -4,19 +4,16 @@ A line segment in a photo and the camera center span a plane that contains the d
 the unit normal of the plane represents a segment, and the segments of all posed photos vote together.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.geometry.poses import axis_angle_deg, component_along, normalize, perpendicular_basis, smallest_eigenvector
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import ByteArray, FloatArray, IndexArray
 
 
-@dataclass(frozen=True, slots=True)
-class LineOptions:
+class OPTIONS:
     """Constants of line segments and vanishing directions."""
 
     longer_side_px: int = 1000
@@ -44,10 +41,7 @@ class LineOptions:
     """Least sine of the angle between a segment and its vanishing point; bounds the weight of closer segments."""
 
 
-OPTIONS = LineOptions()
-
-
-def line_segments(gray: NDArray[np.uint8]) -> NDArray[np.float64]:
+def line_segments(gray: ByteArray) -> FloatArray:
     """Find line segments (N, 4) x1, y1, x2, y2 in a gray photo, longest first, by LSD (von Gioi et al. 2010)."""
     small = shrink(gray, OPTIONS.longer_side_px)
     size = small.shape[::-1]
@@ -62,7 +56,7 @@ def line_segments(gray: NDArray[np.uint8]) -> NDArray[np.float64]:
     return np.asarray(segments[order] * np.tile([gray.shape[1] / size[0], gray.shape[0] / size[1]], 2), np.float64)
 
 
-def shrink(gray: NDArray[np.uint8], longer_side_px: int) -> NDArray[np.uint8]:
+def shrink(gray: ByteArray, longer_side_px: int) -> ByteArray:
     """Return a gray photo (H, W) whose longer side is at most this long."""
     scale = min(1.0, longer_side_px / max(gray.shape))
     size = (max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale)))
@@ -78,7 +72,7 @@ class Segments(NamedTuple):
     """(N, 3) unit directions from the camera center to the segments' middles."""
     lengths: FloatArray
     """(N,) weights, the lengths in pixels."""
-    photos: NDArray[np.int64]
+    photos: IndexArray
     """(N,) number of each segment's photo."""
 
 

@@ -2,10 +2,9 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.fundamental.a_contrario import MOST_FALSE_ALARMS, accidental_share, false_alarms
 from sfm_app.fundamental.pretests import BailOut, PreTest
@@ -16,11 +15,10 @@ from sfm_app.fundamental.solvers import decompose_symmetric
 from sfm_app.jit import kernel
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, EpipolarGeometry, Rejected
-from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 
-@dataclass(frozen=True, slots=True)
-class DegeneracyOptions:
+class DEGENERACY:
     """When matches count as degenerate."""
 
     off: float = 2.0
@@ -44,9 +42,6 @@ class DegeneracyOptions:
     Mismatches on rows of bricks agree with a vanishing point as epipole far more often than by chance."""
     rotation_tolerance: float = 0.05
     """Largest relative stretch of a rotation's homography, for some focal length. Chosen by hand."""
-
-
-DEGENERACY = DegeneracyOptions()
 
 
 # Dominant plane: the plane with most of a model's inliers, and the matches off it. Hartley and Zisserman (2004),
@@ -337,8 +332,7 @@ SAME_PHOTO = "the same photo twice, or nearly"
 ONLY_A_LOGO = "nothing in common but a logo or time stamp"
 
 
-@dataclass(frozen=True, slots=True)
-class WatermarkOptions:
+class WATERMARK:
     """When matches that stay in place are no part of the scene."""
 
     peak: float = 1.0
@@ -358,9 +352,6 @@ class WatermarkOptions:
     """Share of the cells with keypoints that a logo does not exceed. Chosen by hand."""
     explained_share: float = 0.9
     """Share of the stationary matches that a motion without rotation explains. Chosen by hand."""
-
-
-WATERMARK = WatermarkOptions()
 
 
 def find_stationary(x1: FloatArray, x2: FloatArray, unit_px: float = 1.0) -> BoolArray:
@@ -421,7 +412,7 @@ def one_per_cell(points: FloatArray, size: tuple[int, int]) -> FloatArray:
     return points[np.unique(_cells(points, size), return_index=True)[1]]
 
 
-def _cells(points: FloatArray, size: tuple[int, int]) -> NDArray[np.int64]:
+def _cells(points: FloatArray, size: tuple[int, int]) -> IndexArray:
     cells = WATERMARK.cells
     columns, rows = (points / size * cells).astype(np.int64).clip(0, cells - 1).T
     return np.asarray(cells * rows + columns)

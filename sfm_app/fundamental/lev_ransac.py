@@ -8,7 +8,6 @@ models optimized on all matches nearby. Fine scales distinguish the true geometr
 """
 
 import math
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -31,8 +30,7 @@ from sfm_app.types import EpipolarFit, Rejected
 from sfm_app.types.arrays import FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class LevRansacOptions:
+class OPTIONS:
     """Scales and limits, chosen together on the Strecha sets (docs/algorithms/lev-ransac.md).
 
     `python -m benchmarks.fundamental --real DATA --ablation` measures the parts they belong to.
@@ -67,9 +65,6 @@ class LevRansacOptions:
     """Fewer are no evidence: a model always goes through seven. Chosen by hand."""
 
 
-OPTIONS = LevRansacOptions()
-
-
 def search_patience(points: FloatArray, F: FloatArray, threshold: float) -> float:
     """Return how many samples without a better model are enough to accept this one; inf where support may be chance.
 
@@ -97,11 +92,7 @@ def search_patience(points: FloatArray, F: FloatArray, threshold: float) -> floa
 
 
 def _optimize_locally(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Fit by 8 points to the matches within twice the threshold, then step on the Sampson distance at both scales.
-
-    A model through seven noisy matches misses many true ones by more than the threshold; a fit to the wider set reaches
-    them (Chum, Matas and Kittler 2003).
-    """
+    """Fit to the matches within twice the threshold, then refine at both scales (Chum, Matas and Kittler 2003)."""
     squared = squared_distances(points, np.ascontiguousarray(F).reshape(9))
     near = np.flatnonzero(squared <= (OPTIONS.sampson_reach * threshold) ** 2)[: OPTIONS.local_matches]
     nearby, wide = np.asfortranarray(points[near]), squared[near] <= (OPTIONS.algebraic_reach * threshold) ** 2

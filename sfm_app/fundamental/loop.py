@@ -145,11 +145,7 @@ def draw_sample(draws: SamplingPlan, state: RandomState, sample: IndexArray) -> 
 
 
 class BestModel:
-    """The best model so far, and the penalties that the next one has to beat: F* and Q* of Algorithm 1.
-
-    The thesis starts with Q* = 0; a penalty to be minimized has to start at infinity. Two scores at once, and a bar for
-    each kind of sample, are ours.
-    """
+    """The best model so far, and the penalties that the next one has to beat: F* and Q* of Algorithm 1."""
 
     f: FloatArray
     """(9,) entries of F, norm 1; F* of the thesis."""

@@ -16,11 +16,7 @@ _LARGEST_PX = 1e15
 
 
 def check_points(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return matched points as two contiguous (N, 2) float64 arrays of pixels; N may be 0.
-
-    Raises:
-        ValueError: not (N, 2), not of equal length, not real numbers, not finite, or beyond 1e15 px.
-    """
+    """Return matched points as contiguous (N, 2) float64 pixels, N >= 0; ValueError if they are malformed."""
     checked = [_check(x, name) for x, name in ((x1, "x1"), (x2, "x2"))]
     if len(checked[0]) != len(checked[1]):
         raise ValueError(f"x1 and x2 must pair up row by row, got {len(checked[0])} and {len(checked[1])} points")
@@ -35,9 +31,7 @@ def _check(x: ArrayLike, name: str) -> FloatArray:
         raise ValueError(f"{name} must hold real numbers, got {points.dtype}")
     points = np.ascontiguousarray(points, dtype=np.float64)
     if not np.isfinite(points).all():
-        raise ValueError(
-            f"{name} holds {np.count_nonzero(~np.isfinite(points).all(axis=1))} points that are not finite"
-        )
+        raise ValueError(f"{name} has {np.count_nonzero(~np.isfinite(points).all(axis=1))} points that are not finite")
     if len(points) and np.abs(points).max() > _LARGEST_PX:
         raise ValueError(f"{name} must lie within {_LARGEST_PX:.0e} px, got {np.abs(points).max():.1e}")
     return points

@@ -111,8 +111,7 @@ def bail_out_table(count: int, inlier_share: float) -> IndexArray:
 # with a probability of at most 1/A.
 
 
-@dataclass(frozen=True, slots=True)
-class SprtOptions:
+class SPRT:
     """Times, first guesses and limits of the sequential test; guesses and limits were chosen by hand."""
 
     model_cost: float = 160.0
@@ -132,9 +131,6 @@ class SprtOptions:
     """Relative change of delta that calls for a new test (docs/algorithms/fundamental-matrices.md)."""
     review: int = 100
     """Largest number of trials between two updates of delta."""
-
-
-SPRT = SprtOptions()
 
 
 @dataclass(frozen=True, slots=True)

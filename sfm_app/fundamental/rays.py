@@ -6,7 +6,6 @@ matches as bearing vectors in pixels, see `camera.bearings`; `E` is of rays, q' 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,24 +17,13 @@ from sfm_app.fundamental.lev_ransac import OPTIONS as LEV_RANSAC
 from sfm_app.fundamental.leverage import cook_distances, mad_sigma, priors, studentized_residuals
 from sfm_app.fundamental.samples import required_trials
 from sfm_app.fundamental.solvers import RAY_SAMPLE_SIZE, solve_five_point
-from sfm_app.geometry.epipolar import (
-    FIRST,
-    SECOND,
-    decompose_essential,
-    fit_rays,
-    gradients,
-    nearest_essential,
-    rotation_residuals,
-    signed_distances,
-    squared_distances,
-)
+from sfm_app.geometry import epipolar
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import Calibration, RayFit, Rejected
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 
-@dataclass(frozen=True, slots=True)
-class RayOptions:
+class OPTIONS:
     """Samples, scores and the test for a rotation; none was measured on its own. Chosen by hand."""
 
     batch: int = 32
@@ -51,12 +39,11 @@ class RayOptions:
     """Fits that select inliers through lenses."""
 
 
-OPTIONS = RayOptions()
-
-
 def fit_lev_ransac_rays(lines: FloatArray, options: EpipolarSettings, seed: int) -> RayFit | Rejected:
     """Estimate E of a pair with known lenses from matches, many of which may be wrong."""
-    _, first = np.unique(np.hstack([lines[:, FIRST], lines[:, SECOND]]).round(9), axis=0, return_index=True)
+    _, first = np.unique(
+        np.hstack([lines[:, epipolar.FIRST], lines[:, epipolar.SECOND]]).round(9), axis=0, return_index=True
+    )
     rng = np.random.default_rng(seed)
     distinct = lines[rng.permutation(np.sort(first))]
     if len(distinct) < options.min_inliers:
@@ -64,13 +51,13 @@ def fit_lev_ransac_rays(lines: FloatArray, options: EpipolarSettings, seed: int)
     E, trials = _search(distinct, options, rng)
     if E is None:
         return Rejected(NO_MODEL)
-    squared = squared_distances(E[None], distinct)[0]
+    squared = epipolar.squared_distances(E[None], distinct)[0]
     inliers = squared <= options.max_error_px**2
     if np.count_nonzero(inliers) < options.min_inliers:
         return Rejected(TOO_FEW_INLIERS)
     if model_false_alarms(squared, _mismatch_distances(E, distinct), options.max_error_px) > MOST_FALSE_ALARMS:
         return Rejected(CHANCE)
-    all_squared = squared_distances(E[None], lines)[0]
+    all_squared = epipolar.squared_distances(E[None], lines)[0]
     accepted = all_squared <= options.max_error_px**2
     rms, kind = math.sqrt(float(all_squared[accepted].mean())), _find_degeneracy(E, distinct[inliers], options)
     return RayFit(E, accepted, validity(lines, E, options.max_error_px), trials, rms, kind)
@@ -83,18 +70,20 @@ def select_inliers(
     lines = np.hstack([bearings(x, camera) for x, camera in zip(points, cameras, strict=True)])
     agreeing, slope = inliers, np.ones(len(lines))
     for _ in range(OPTIONS.rounds):
-        F = fit_rays(lines[:, FIRST], lines[:, SECOND], agreeing * slope**-2.0)
-        agreeing, slope = squared_distances(F[None], lines)[0] <= threshold**2, gradients(F, lines)
+        F = epipolar.fit_rays(lines[:, epipolar.FIRST], lines[:, epipolar.SECOND], agreeing * slope**-2.0)
+        agreeing, slope = epipolar.squared_distances(F[None], lines)[0] <= threshold**2, epipolar.gradients(F, lines)
     return agreeing
 
 
 def validity(lines: FloatArray, E: FloatArray, threshold: float) -> FloatArray:
     """Return (N,) p(v_i) of every match from its influence on E (thesis 4.7.2 and 4.7.3)."""
-    distances = np.abs(signed_distances(E, lines))
+    distances = np.abs(epipolar.signed_distances(E, lines))
     fitted = distances <= threshold
     if np.count_nonzero(fitted) <= 9:
         return np.ones(len(lines))
-    rows = (lines[:, SECOND][:, :, None] * lines[:, FIRST][:, None, :]).reshape(-1, 9) / gradients(E, lines)[:, None]
+    rows = (lines[:, epipolar.SECOND][:, :, None] * lines[:, epipolar.FIRST][:, None, :]).reshape(
+        -1, 9
+    ) / epipolar.gradients(E, lines)[:, None]
     tangent = np.linalg.svd(E.reshape(1, 9))[2][1:].T
     within = rows @ tangent
     values, vectors = np.linalg.eigh(within[fitted].T @ within[fitted])
@@ -112,19 +101,19 @@ def _search(lines: FloatArray, options: EpipolarSettings, rng: np.random.Generat
     while trials < limit:
         samples = _draw(rng, chances if best is not None else None, len(lines))
         trials += OPTIONS.batch
-        models = solve_five_point(lines[samples][..., FIRST], lines[samples][..., SECOND])
+        models = solve_five_point(lines[samples][..., epipolar.FIRST], lines[samples][..., epipolar.SECOND])
         if not len(models):
             continue
-        costs = _costs(squared_distances(models, scored), LEV_RANSAC.coarse * threshold).sum(axis=1)
+        costs = _costs(epipolar.squared_distances(models, scored), LEV_RANSAC.coarse * threshold).sum(axis=1)
         k = int(np.argmin(costs))
         if costs[k] >= coarse:
             continue
         coarse = float(costs[k])
         optimized = _optimize_locally(lines, models[k], threshold)
-        cost = float(_costs(squared_distances(optimized[None], lines), LEV_RANSAC.fine * threshold).sum())
+        cost = float(_costs(epipolar.squared_distances(optimized[None], lines), LEV_RANSAC.fine * threshold).sum())
         if cost < lowest:
             best, lowest, chances = optimized, cost, validity(lines, optimized, threshold)
-            share = float(np.mean(squared_distances(optimized[None], lines)[0] <= threshold**2))
+            share = float(np.mean(epipolar.squared_distances(optimized[None], lines)[0] <= threshold**2))
             needed = max(OPTIONS.least_trials, required_trials(share**RAY_SAMPLE_SIZE, options.confidence))
             limit = math.ceil(min(options.max_trials, OPTIONS.most_trials, needed))
     return best, trials
@@ -140,12 +129,12 @@ def _draw(rng: np.random.Generator, chances: FloatArray | None, count: int) -> I
 
 def _optimize_locally(lines: FloatArray, E: FloatArray, threshold: float) -> FloatArray:
     """Refit to all matches with weights by the cost at the coarse scale, then at the fine one."""
-    p, q = lines[:, FIRST], lines[:, SECOND]
+    p, q = lines[:, epipolar.FIRST], lines[:, epipolar.SECOND]
     for scale, steps in zip((LEV_RANSAC.coarse, LEV_RANSAC.fine), LEV_RANSAC.local_steps, strict=True):
         for _ in range(steps):
-            squared, slope = squared_distances(E[None], lines)[0], gradients(E, lines)
+            squared, slope = epipolar.squared_distances(E[None], lines)[0], epipolar.gradients(E, lines)
             weights = (1.0 + squared / (scale * threshold) ** 2) ** -2 * slope**-2
-            E = nearest_essential(fit_rays(p, q, weights))
+            E = epipolar.nearest_essential(epipolar.fit_rays(p, q, weights))
     return np.asarray(E / np.linalg.norm(E), np.float64)
 
 
@@ -156,12 +145,12 @@ def _costs(squared: FloatArray, scale: float) -> FloatArray:
 def _mismatch_distances(E: FloatArray, lines: FloatArray) -> FloatArray:
     shifts = range(1, min(OPTIONS.mismatches, len(lines) - 1) + 1)
     wrong = [np.hstack([lines[:, :9], np.roll(lines[:, 9:], shift, axis=0)]) for shift in shifts]
-    return np.concatenate([squared_distances(E[None], one)[0] for one in wrong])
+    return np.concatenate([epipolar.squared_distances(E[None], one)[0] for one in wrong])
 
 
 def _find_degeneracy(E: FloatArray, inliers: FloatArray, options: EpipolarSettings) -> str:
     """Return "rotation" if one of the two rotations of E explains the inliers alone."""
     within = DEGENERACY.off * options.max_error_px
-    rotations = (decompose_essential(E)[0][0], decompose_essential(E)[2][0])
-    shares = [float(np.mean(rotation_residuals(inliers, R) <= within)) for R in rotations]
+    rotations = (epipolar.decompose_essential(E)[0][0], epipolar.decompose_essential(E)[2][0])
+    shares = [float(np.mean(epipolar.rotation_residuals(inliers, R) <= within)) for R in rotations]
     return "rotation" if max(shares) >= DEGENERACY.clear_share else ""

@@ -363,13 +363,7 @@ _DAMPING = DampingRange(first=1e-4, least=1e-12, most=1e12)
 def refine_reprojection(
     points: FloatArray, F: FloatArray, *, scale: float = np.inf, most_steps: int = 20
 ) -> FloatArray:
-    """Move F to a local minimum of the cost above; returns (3, 3), rank 2, Frobenius norm 1.
-
-    `points` are inliers; `scale` is the Cauchy scale c, inf for least squares.
-
-    Raises:
-        NumericalError: F is zero or not finite.
-    """
+    """Move F to a local minimum of the cost above; `scale` is Cauchy's c, inf for least squares."""
     softness = 1.0 / (scale * scale)
     F = to_unit_norm(nearest_rank_two(to_unit_norm(F)))
     moves = _moves(points, F)
@@ -454,11 +448,7 @@ def _refit_reprojection(points: FloatArray, F: FloatArray, threshold: float) -> 
     return F if len(inliers) < 8 else refine_reprojection(inliers, refit_sampson(points, F, threshold))
 
 
-REFITS: dict[str, Refit] = {
-    "eight-point": _refit_eight_point,
-    "sampson": refit_sampson,
-    "reprojection": _refit_reprojection,
-}
+REFITS = {"eight-point": _refit_eight_point, "sampson": refit_sampson, "reprojection": _refit_reprojection}
 """Values of `EpipolarSettings.refit` besides "auto"."""
 
 

@@ -107,6 +107,6 @@ def required_trials(success: float, confidence: float, log_missed: float = 0.0) 
     return remaining / math.log1p(-success) if success > 0 else math.inf
 
 
-def has_converged(before: NDArray[np.float64], after: NDArray[np.float64], limit: float = CONVERGED) -> bool:
+def has_converged(before: FloatArray, after: FloatArray, limit: float = CONVERGED) -> bool:
     """Return whether the priors (N,), of sum 1, changed by less than `limit` in sum, in [0, 2] (thesis 4.18)."""
     return bool(np.abs(after / after.sum() - before / before.sum()).sum() < limit)

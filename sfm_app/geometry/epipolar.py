@@ -7,10 +7,10 @@ any scale; other shapes raise ValueError. HZ: Hartley and Zisserman, Multiple Vi
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sfm_app.errors import NumericalError
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray
 
 
 def to_homogeneous(x: ArrayLike) -> FloatArray:
@@ -393,7 +393,7 @@ class TwoViewSeed:
     t: FloatArray
     points: FloatArray
     """(N, 3), one per inlier, in the order given."""
-    usable: NDArray[np.bool_]
+    usable: BoolArray
     """(N,) whether a point is in front of both cameras and its triangulation angle determines its depth."""
     angle_deg: float
     """Median triangulation angle of the points in front of both cameras."""
@@ -417,7 +417,7 @@ def ray_seed(R: FloatArray, t: FloatArray, lines: FloatArray) -> TwoViewSeed:
     return _judge_seed(R, t, X, (first > 0) & (second > 0))
 
 
-def _judge_seed(R: FloatArray, t: FloatArray, X: FloatArray, in_front: NDArray[np.bool_]) -> TwoViewSeed:
+def _judge_seed(R: FloatArray, t: FloatArray, X: FloatArray, in_front: BoolArray) -> TwoViewSeed:
     angles = triangulation_angle_deg(X, np.zeros(3), -R.T @ t)
     angle = float(np.median(angles[in_front])) if in_front.any() else 0.0
     usable = in_front & (angles > min(1.0, angle / 4))

@@ -10,7 +10,7 @@ from sfm_app.errors import NumericalError
 from sfm_app.geometry.epipolar import FIRST, SECOND, depths
 from sfm_app.jit import kernel
 from sfm_app.numerical import MAD_TO_SIGMA
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray
 
 
 def normalize(vectors: ArrayLike) -> FloatArray:
@@ -140,13 +140,13 @@ def _distances(lines: FloatArray, pose: FloatArray) -> FloatArray:
     return distances
 
 
-def is_in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
+def is_in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> BoolArray:
     """Return a mask (N,) of the matches `used` (N, 18) whose points lie in front of both cameras."""
     first, second = depths(used, R, t)
     return (first > 0) & (second > 0)
 
 
-def explained_mask(lines: FloatArray, R: FloatArray, t: FloatArray, max_error_px: float) -> NDArray[np.bool_]:
+def explained_mask(lines: FloatArray, R: FloatArray, t: FloatArray, max_error_px: float) -> BoolArray:
     """Return a mask (N,) of the matches (N, 18) that lie on their epipolar lines, in front of both cameras."""
     return (pose_distances(lines, R, t) <= max_error_px) & is_in_front(lines, R, t)
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from sfm_app.geometry.poses import normalize
 from sfm_app.jit import kernel
 from sfm_app.types import Surface
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import BoolArray, Float32Array, FloatArray, IndexArray
 
 
 def vertex_normals(vertices: FloatArray, faces: IndexArray) -> FloatArray:
@@ -103,7 +103,7 @@ def median_edge_length(vertices: FloatArray, faces: IndexArray) -> float:
     return float(np.median(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)))
 
 
-def select_faces(surface: Surface, keep: NDArray[np.bool_]) -> Surface:
+def select_faces(surface: Surface, keep: BoolArray) -> Surface:
     """Return the triangles with True in `keep` (T,), and the vertices that they use, in the same order."""
     used, faces = number_vertices(surface.faces[keep])
     return Surface(surface.vertices[used], faces.astype(np.int64), surface.colors[used])
@@ -148,12 +148,8 @@ def split_fans(surface: Surface) -> Surface:
 
 
 def corner_tangents(
-    vertices: FloatArray,
-    normals: FloatArray,
-    faces: NDArray[np.int64],
-    uv: NDArray[np.float32],
-    page: NDArray[np.int32],
-) -> NDArray[np.float32]:
+    vertices: FloatArray, normals: FloatArray, faces: IndexArray, uv: Float32Array, page: NDArray[np.int32]
+) -> Float32Array:
     """Return tangents (T, 3, 4) of the corners of triangles: a unit vector, and the handedness, 1 or -1.
 
     The tangent points right in the texture; the bitangent, handedness times the cross product of normal and tangent,
@@ -188,9 +184,7 @@ def _face_tangents(corners: FloatArray, places: FloatArray) -> tuple[FloatArray,
     return normalize(np.sign(area)[:, None] * (vc[:, None] * b - vb[:, None] * c)), handed
 
 
-def _shared_corners(
-    faces: NDArray[np.int64], uv: NDArray[np.float32], page: NDArray[np.int32], handed: FloatArray
-) -> NDArray[np.int64]:
+def _shared_corners(faces: IndexArray, uv: Float32Array, page: NDArray[np.int32], handed: FloatArray) -> IndexArray:
     """Return (3 T,) for each corner the number of the group that has vertex, place, page and handedness in common."""
     place = uv.reshape(-1, 2)
     keys = (place[:, 1], place[:, 0], np.repeat(handed, 3), np.repeat(page, 3), faces.ravel())

@@ -33,8 +33,7 @@ NOT_NEEDED = "all at once: not needed"
 """Note of a global mapper that was stopped."""
 
 
-@dataclass(frozen=True, slots=True)
-class MappingOptions:
+class MAPPING:
     """When mapping starts, ends, and counts as good."""
 
     dissent_weight: float = 0.1
@@ -72,9 +71,6 @@ class MappingOptions:
     """Photos up to which mapping uses all pairs. Chosen by hand."""
     mapped_partners: int = 16
     """Partners of each photo above. Chosen by hand."""
-
-
-MAPPING = MappingOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,9 +127,7 @@ def coverage(matches: MatchGraph, pair: PairId, pose: RelativePose) -> float:
     shares = []
     for photo, x in zip(pair, matches.points(pair), strict=True):
         image = matches.images[photo]
-        cells = (
-            (x[pose.inliers] / [image.width, image.height] * MAPPING.grid).astype(np.int64).clip(0, MAPPING.grid - 1)
-        )
+        cells = (x[pose.inliers] / [image.width, image.height] * MAPPING.grid).astype(int).clip(0, MAPPING.grid - 1)
         filled = len(np.unique(cells[:, 0] * MAPPING.grid + cells[:, 1]))
         shares.append(filled / min(MAPPING.grid * MAPPING.grid, max(pose.inlier_count, 1)))
     return float(np.sqrt(shares[0] * shares[1]))

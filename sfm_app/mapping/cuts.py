@@ -16,8 +16,7 @@ Links = Mapping[int, Mapping[int, float]]
 """Weight of the pairs of each photo, by the other photo."""
 
 
-@dataclass(frozen=True, slots=True)
-class CutOptions:
+class OPTIONS:
     """How a group is cut into parts. Chosen by hand."""
 
     saturation_inliers: float = 100.0
@@ -36,9 +35,6 @@ class CutOptions:
     """Photos that each of two neighboring parts gets from the other one."""
     min_across: int = 3
     """Least pairs between two parts that makes them neighbors."""
-
-
-OPTIONS = CutOptions()
 
 
 @dataclass(frozen=True, slots=True)

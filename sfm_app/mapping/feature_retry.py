@@ -6,7 +6,7 @@ threshold and a looser ratio test give more there. For all photos they would cos
 
 from collections import Counter
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,13 +22,12 @@ from sfm_app.plugins import SIFT_DSP
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import SubWorkspace
 from sfm_app.types import Evidence, MatchGraph, PairId
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import FloatArray, IndexArray
 
 Rows = NDArray[np.uint32]
 
 
-@dataclass(frozen=True, slots=True)
-class RetryOptions:
+class OPTIONS:
     """Finer features for unregistered photos."""
 
     same_px: float = 0.5
@@ -39,9 +38,6 @@ class RetryOptions:
     """Photos with most raw matches that each unregistered photo is matched with. Chosen by hand."""
     in_order: int = 2
     """Photos before and after it by name that each is matched with. Chosen by hand."""
-
-
-OPTIONS = RetryOptions()
 
 
 def add_matches(
@@ -62,7 +58,7 @@ def add_matches(
     return replace(matches, keypoints=all_keypoints, matches=dict(sorted(rows.items()))), tuple(sorted(enriched))
 
 
-def _merge_keypoints(known: FloatArray, added: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+def _merge_keypoints(known: FloatArray, added: FloatArray) -> tuple[FloatArray, IndexArray]:
     """Return all keypoints of a photo, and the index of each added one among them."""
     from scipy.spatial import cKDTree
 

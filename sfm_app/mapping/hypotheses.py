@@ -34,8 +34,7 @@ from sfm_app.settings import FIRST_TRIAL, HYPOTHESES, HypothesisName
 from sfm_app.types import Evidence, Intrinsics
 
 
-@dataclass(frozen=True, slots=True)
-class HypothesisOptions:
+class OPTIONS:
     """When other hypotheses are tried, and accepted."""
 
     other_focals: tuple[float, ...] = (0.6, 2.4, 4.8)
@@ -52,9 +51,6 @@ class HypothesisOptions:
     """With more photos, a pass costs more than it promises. Chosen by hand."""
     max_remaining_share: float = 0.5
     """Share of the contradictions that may remain with more cameras. Chosen on `benchmarks.trouble`."""
-
-
-OPTIONS = HypothesisOptions()
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,21 +4,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.colmap.joined_model import PlacedPhotos
 from sfm_app.geometry.poses import Similarity, explained_mask, robust_similarity
 from sfm_app.numerical import FAILURES
 from sfm_app.posegraph.rotations import average_rotations, connected_groups, partners_of
 from sfm_app.types import MatchGraph, PairId, ViewGraph
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 # Joins. One photo in both models determines a similarity: rotation and position by its camera, scale by the distances
 # of its points. The similarity with which most shared photos agree is refined on their points.
 
 
-@dataclass(frozen=True, slots=True)
-class JoinOptions:
+class OPTIONS:
     """Similarities between fragments, and their errors. Chosen by hand."""
 
     min_photos: int = 3
@@ -51,9 +49,6 @@ class JoinOptions:
     """Largest angle of a photo to its pose in the merged model for its points to count."""
     same_shift: float = 0.25
     """Largest shift of it, as a share of the median distance of its points."""
-
-
-OPTIONS = JoinOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,7 +150,7 @@ class _SharedPhotos:
                 medians[number] = np.median(values[of_photo])
         return medians
 
-    def best_hypothesis(self) -> tuple[NDArray[np.bool_], Similarity]:
+    def best_hypothesis(self) -> tuple[BoolArray, Similarity]:
         """Return a mask of the agreeing photos for the best similarity of a single photo, and this similarity."""
         best, score = (np.zeros(len(self.ca), np.bool_), Similarity(1.0, np.eye(3), np.zeros(3))), (0, 0.0)
         for number in np.flatnonzero(np.isfinite(self.scale)):
@@ -167,7 +162,7 @@ class _SharedPhotos:
                 best, score = (agreeing, candidate), rank
         return best
 
-    def agreement(self, similarity: Similarity) -> tuple[NDArray[np.bool_], FloatArray]:
+    def agreement(self, similarity: Similarity) -> tuple[BoolArray, FloatArray]:
         """Return (n,) which photos agree, and their shifts by the distance of their points."""
         angles = _angles_deg(self.Ra, np.einsum("nij,kj->nik", self.Rb, similarity.R))
         shifts = np.linalg.norm(similarity(self.cb) - self.ca, axis=1) / self.distance
@@ -299,18 +294,14 @@ def _synchronize(joins: Sequence[Join], count: int) -> dict[int, Similarity]:
     scales = np.exp(_robust_potentials(count, edges, logs, strengths, np.ones(len(joins)))[:, 0])
     turns = [Similarity(float(scale), rotations.get(k, np.eye(3)), np.zeros(3)) for k, scale in enumerate(scales)]
     # where the shared photos are, errors of rotations shift least
-    steps = np.concatenate(
-        [turns[join.first](join.similarity(join.middle)) - turns[join.second](join.middle) for join in joins]
-    )
+    steps = np.concatenate([turns[j.first](j.similarity(j.middle)) - turns[j.second](j.middle) for j in joins])
     sizes = np.full(len(joins), max(float(np.linalg.norm(steps, axis=1).mean()), 1e-300))
     shifts = _robust_potentials(count, edges, steps, strengths, sizes)
-    return frames | {
-        number: Similarity(float(scales[number]), rotations[number], shifts[number]) for number in sorted(rotations)
-    }
+    return frames | {k: Similarity(float(scales[k]), rotations[k], shifts[k]) for k in sorted(rotations)}
 
 
 def _robust_potentials(
-    count: int, edges: NDArray[np.int64], steps: FloatArray, strengths: FloatArray, sizes: FloatArray
+    count: int, edges: IndexArray, steps: FloatArray, strengths: FloatArray, sizes: FloatArray
 ) -> FloatArray:
     """Return (count, k) values with the least distances to steps (J, k), second less first, along edges (J, 2)."""
     groups = connected_groups(((a, b) for a, b in edges.tolist()), range(count))
@@ -335,9 +326,7 @@ def merge_fragments(fragments: Sequence[Fragment], frames: Mapping[int, Similari
         R = np.einsum("nij,kj->nik", placed.R, frame.R)
         models[number] = replace(placed, R=R, centers=frame(placed.centers), X=frame(placed.X))
     photos, R, centers, source = _choose_poses(fragments, models)
-    cameras = {
-        photo: models[number].cameras[photo] for photo, number in zip(photos.tolist(), source.tolist(), strict=True)
-    }
+    cameras = {k: models[n].cameras[k] for k, n in zip(photos.tolist(), source.tolist(), strict=True)}
     tracks = [_sound_observations(model, photos, R, centers) for model in models.values()]
     X, point, photo, keypoint = _merge_tracks(tracks)
     return PlacedPhotos(photos, R, centers, X, point, photo, keypoint, cameras)

@@ -28,8 +28,7 @@ from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 # Recognized look-alikes: their matches are hidden from mapping, and reported.
 
 
-@dataclass(frozen=True, slots=True)
-class JumpOptions:
+class JUMPS:
     """Jumps in the order of photos. Chosen by hand."""
 
     min_photos: int = 30
@@ -38,9 +37,6 @@ class JumpOptions:
     """Length of a jump, in median steps."""
     max_share: float = 0.1
     """Share of jumps above which photos count as unordered."""
-
-
-JUMPS = JumpOptions()
 
 
 def joined_pairs(joins: Iterable[LookAlikes]) -> set[PairId]:
@@ -116,8 +112,7 @@ def sides(pairs: Sequence[PairId], matches: MatchGraph) -> tuple[list[int], list
 # stand at the same place, look the same way, and share no point (Zach et al. 2010, Heinly et al. 2014).
 
 
-@dataclass(frozen=True, slots=True)
-class OverlapOptions:
+class OVERLAPS:
     """Expected overlaps of photos, and false joins; docs/algorithms/look-alikes.md."""
 
     candidates: int = 40
@@ -143,9 +138,6 @@ class OverlapOptions:
     """Times that photos are mapped again without more look-alikes. Chosen by hand."""
     min_missing: float = 0.5
     """Share of the expected cells across a false join that must be missing. Chosen by hand."""
-
-
-OVERLAPS = OverlapOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,9 +233,7 @@ def _neighbors(posed: Mapping[int, PosedPhotoPoints]) -> Iterator[PairId]:
         nearby = nearby[
             (directions[nearby] @ directions[number] > np.cos(np.radians(OVERLAPS.max_angle_deg))) & (nearby != number)
         ]
-        chosen = nearby[
-            np.unique(np.linspace(0, len(nearby) - 1, min(OVERLAPS.candidates, len(nearby))).astype(np.int64))
-        ]
+        chosen = nearby[np.unique(np.linspace(0, len(nearby) - 1, min(OVERLAPS.candidates, len(nearby))).astype(int))]
         yield from ((photos[number], photos[other]) for other in chosen)
 
 
@@ -333,10 +323,7 @@ def _affinity(overlap: ExpectedOverlap) -> float:
 def _assign_sides(
     non_overlapping: Mapping[PairId, ExpectedOverlap], overlaps: Mapping[PairId, ExpectedOverlap]
 ) -> dict[int, int]:
-    """Return the side, 1 or -1, of all photos with overlaps, the surest first.
-
-    Photos with the expected overlap pull a photo to their side, others push it to the opposite one.
-    """
+    """Return the side, 1 or -1, of all photos with overlaps, the surest first."""
     affinities: dict[int, dict[int, float]] = {photo: {} for photo in chain(*overlaps)}
     for (a, b), one in overlaps.items():
         affinities[a][b] = affinities[b][a] = _affinity(one)

@@ -70,8 +70,7 @@ FOLDER, STOP = "parts", "stop"
 """Folder of the parts, and the file in it that stops them all."""
 
 
-@dataclass(frozen=True, slots=True)
-class PartOptions:
+class OPTIONS:
     """When groups are mapped in parts. Chosen by hand."""
 
     max_whole: int = 400
@@ -84,9 +83,6 @@ class PartOptions:
     """Share of contradicting inliers of F above which the whole is mapped, too."""
     min_matches: int = 16
     """Matches across a join below which these decide nothing, as of a pair."""
-
-
-OPTIONS = PartOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,11 +121,7 @@ def part_size(photos: int, options: SceneSettings) -> int:
 def map_in_parts(
     group: Group, mapped: PoseGraph, run: RunContext, *, stop_at_false_joins: bool = True
 ) -> tuple[list[MappingResult], tuple[LookAlikes, ...]]:
-    """Return the results of mapping a group in parts, or else the false joins within parts, which stop the mapping.
-
-    A group of one part gives neither. `mapped` is the pose graph with the pairs that mapping follows; it is in the
-    database of the run.
-    """
+    """Return the results of mapping a group in parts, or else the false joins within parts, which stop the mapping."""
     parts = cut_group(group.graph, group.photos, part_size(len(group.photos), run.settings.scene))
     if len(parts) < 2:
         return [], ()

@@ -19,8 +19,7 @@ from sfm_app.progress import Progress
 from sfm_app.types import MatchedImage, MatchGraph
 
 
-@dataclass(frozen=True, slots=True)
-class ShutterOptions:
+class OPTIONS:
     """Measurement of the readout."""
 
     min_frames: int = 10
@@ -36,8 +35,6 @@ class ShutterOptions:
     longest: float = 1.05
     """Longest readout, in intervals between frames: a frame lasts one. By definition, with room for errors."""
 
-
-OPTIONS = ShutterOptions()
 
 logger = logging.getLogger("sfm_app")
 

@@ -2,7 +2,7 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,17 +22,13 @@ if TYPE_CHECKING:
 # see the true layout.
 
 
-@dataclass(frozen=True, slots=True)
-class SplitOptions:
+class OPTIONS:
     """When models are cut, and when a scale is loose."""
 
     min_matches: int = 16
     """Least matches with which a pair can join two parts. Chosen by hand."""
     min_common_points: int = 5
     """Points of two placed photos and the next one, below which the scale between them is undetermined. Measured."""
-
-
-OPTIONS = SplitOptions()
 
 
 def sound_parts(explained: Mapping[PairId, PairSupport], photos: Iterable[int]) -> list[tuple[int, ...]]:

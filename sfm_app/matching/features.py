@@ -43,6 +43,7 @@ from sfm_app.runtime.parallel import ordered_map
 from sfm_app.settings import MatchSettings
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Features, PairId
+from sfm_app.types.arrays import ByteArray, Float32Array, FloatArray
 
 # Features of photos by a plug-in, in COLMAP's database and in parts that keep its descriptors. The method gets
 # pictures of the right size; its results are checked, scaled to the photos' pixels and freed of masked points.
@@ -72,7 +73,7 @@ class _PhotoFile:
 
 def _find_and_save(
     method: FeatureMethod, options: MatchSettings, photos: Path, masks: Path | None, parts: Path, photo: _PhotoFile
-) -> tuple[int, NDArray[np.float32]]:
+) -> tuple[int, Float32Array]:
     pixels = read_pixels(photos / photo.name)
     features, to_photo, size = _find_in_photo(method, photo.name, pixels, options, panorama=photo.panorama)
     keypoints = features.keypoints * to_photo
@@ -90,8 +91,8 @@ def _find_and_save(
 
 
 def _find_in_photo(
-    method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings, *, panorama: bool
-) -> tuple[Features, NDArray[np.float64], tuple[int, int]]:
+    method: FeatureMethod, name: str, pixels: ByteArray, options: MatchSettings, *, panorama: bool
+) -> tuple[Features, FloatArray, tuple[int, int]]:
     """Return the features of one photo, the scale (x, y) that takes them to its pixels, and its size."""
     height, width = pixels.shape[:2]
     if panorama:
@@ -100,7 +101,7 @@ def _find_in_photo(
     return features, np.array([width / features.size[0], height / features.size[1]]), (width, height)
 
 
-def _find_in_views(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
+def _find_in_views(method: FeatureMethod, name: str, pixels: ByteArray, options: MatchSettings) -> Features:
     """Return the features of a panorama from its perspective views; the best of each view come first."""
     size = pixels.shape[1], pixels.shape[0]
     views = PanoramaViews.cover(size, options.max_image_size_px)
@@ -116,7 +117,7 @@ def _find_in_views(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], 
     return joined.select(np.argsort(np.concatenate(ranks), kind="stable"))
 
 
-def read_pixels(path: Path) -> NDArray[np.uint8]:
+def read_pixels(path: Path) -> ByteArray:
     """Return (H, W, 3) RGB of a photo in the workspace; InputError if it can no longer be read."""
     data = np.fromfile(path, np.uint8)
     pixels = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
@@ -125,7 +126,7 @@ def read_pixels(path: Path) -> NDArray[np.uint8]:
     return np.asarray(pixels, np.uint8)
 
 
-def _find_and_check(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
+def _find_and_check(method: FeatureMethod, name: str, pixels: ByteArray, options: MatchSettings) -> Features:
     if method.find is None:
         raise PluginError(f"the features '{method.name}' have no `find`")
     try:
@@ -201,8 +202,7 @@ def _grow_chunk(remaining: list[dict[int, PairId]], size: int) -> list[PairId]:
 # one or two differ in half of the runs).
 
 
-@dataclass(frozen=True, slots=True)
-class ChunkOptions:
+class CHUNKS:
     """Sizes of chunks of work."""
 
     most_photos: int = 8
@@ -219,8 +219,6 @@ class ChunkOptions:
     photos_in_memory: int = 32
     """Photos whose features stay in memory while pairs are matched; the others are read again. Chosen by hand."""
 
-
-CHUNKS = ChunkOptions()
 
 Item = TypeVar("Item")
 

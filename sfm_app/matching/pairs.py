@@ -7,37 +7,24 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app import retrieval
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import largest_descriptors, photo_names, read_features
 from sfm_app.matching.features import match_pairs, read_pixels
 from sfm_app.plugins import FeatureMethod
-from sfm_app.retrieval import (
-    DescriptorArray,
-    choose_by_rank,
-    count_preview_matches,
-    count_shared_keypoints,
-    describe_picture,
-    learn_vocabulary,
-    nearest_words,
-    pairs_in_order,
-    pairs_nearby,
-    pool_descriptors,
-    rank_similar,
-    spread,
-)
 from sfm_app.runtime.context import Earlier, RunContext
 from sfm_app.settings import MatchSettings
 from sfm_app.types import MatchedImage, MatchGraph, PairId
+from sfm_app.types.arrays import ByteArray
 
 # The largest features of all photos become visual words. Photos with common words are compared in previews, and
 # matched where they seem to overlap, with neighbors in name, time and GPS. A second round follows the matches.
 
-ReadDescriptors = Callable[[int], DescriptorArray]
+ReadDescriptors = Callable[[int], retrieval.DescriptorArray]
 """Returns (N, 128) descriptors of a photo, the largest features first."""
 
 
-@dataclass(frozen=True, slots=True)
-class PairChoiceOptions:
+class OPTIONS:
     """How pairs are chosen."""
 
     largest_features: int = 1024
@@ -76,9 +63,6 @@ class PairChoiceOptions:
     """Fewest keypoints of third photos that match in both photos of a pair of the second round. Chosen by hand."""
 
 
-OPTIONS = PairChoiceOptions()
-
-
 def first_pairs(
     images: Mapping[int, MatchedImage], read: ReadDescriptors, run: RunContext, choosers: Collection[int] | None = None
 ) -> list[PairId]:
@@ -91,7 +75,9 @@ def first_pairs(
         near = max(2, round(OPTIONS.sequence_share * count / 2))
         steps = (*range(1, near + 1), *(near * 2**k for k in range(1, 4)))
         count = max(1, round((1 - OPTIONS.sequence_share) * count))
-    chosen = pairs_in_order(list(images.values()), steps) | pairs_nearby(list(images.values()), OPTIONS.nearest_by_gps)
+    chosen = retrieval.pairs_in_order(list(images.values()), steps) | retrieval.pairs_nearby(
+        list(images.values()), OPTIONS.nearest_by_gps
+    )
     return sorted(chosen | _similar_pairs(photos, read, count, run, choosers))
 
 
@@ -99,20 +85,22 @@ def _similar_pairs(
     photos: Sequence[int], read: ReadDescriptors, count: int, run: RunContext, choosers: Collection[int] | None
 ) -> set[PairId]:
     largest = run.map(read, photos, "largest features")
-    pooled = pool_descriptors(largest, OPTIONS.pooled)
+    pooled = retrieval.pool_descriptors(largest, OPTIONS.pooled)
     if not len(pooled):
         return set()
     with run.step("visual words"):
         size = min(OPTIONS.most_words, max(OPTIONS.fewest_words, OPTIONS.words_per_photo * len(photos)))
-        vocabulary = learn_vocabulary(pooled, size, run.seed)
-    words = run.map(partial(nearest_words, vocabulary), largest, "words of photos")
-    ranked = rank_similar(words, len(vocabulary), OPTIONS.ranked * count)
+        vocabulary = retrieval.learn_vocabulary(pooled, size, run.seed)
+    words = run.map(partial(retrieval.nearest_words, vocabulary), largest, "words of photos")
+    ranked = retrieval.rank_similar(words, len(vocabulary), OPTIONS.ranked * count)
     candidates = _candidates([[photos[k] for k in row] for row in ranked], photos, count, choosers)
     previews = {photo: one[: OPTIONS.preview_features] for photo, one in zip(photos, largest, strict=True)}
     parts = run.map(partial(_preview, previews), list(candidates.items()), "previews")
     scores = {pair: count for part in parts for pair, count in part.items()}
-    sure = choose_by_rank(scores, 1, max(1, round(OPTIONS.sure_share * count)), choosers)
-    return sure | choose_by_rank(scores, round(OPTIONS.preview_share * OPTIONS.preview_features), count, choosers)
+    sure = retrieval.choose_by_rank(scores, 1, max(1, round(OPTIONS.sure_share * count)), choosers)
+    return sure | retrieval.choose_by_rank(
+        scores, round(OPTIONS.preview_share * OPTIONS.preview_features), count, choosers
+    )
 
 
 def second_pairs(
@@ -123,10 +111,10 @@ def second_pairs(
     choosers: Collection[int] | None = None,
 ) -> list[PairId]:
     """Choose pairs, not `matched` yet, whose photos match the same keypoints (numbers by photo) of third photos."""
-    shared = count_shared_keypoints(keypoints, matches)
+    shared = retrieval.count_shared_keypoints(keypoints, matches)
     unmatched = {pair: count for pair, count in shared.items() if pair not in matched}
     return sorted(
-        choose_by_rank(
+        retrieval.choose_by_rank(
             unmatched, OPTIONS.fewest_shared, max(1, round(OPTIONS.second_share * options.neighbors)), choosers
         )
     )
@@ -140,7 +128,7 @@ def _candidates(
         (min(photo, other), max(photo, other))
         for photo, others in zip(photos, ranked, strict=True)
         if choosers is None or photo in choosers
-        for other in spread(others, OPTIONS.previewed * count)
+        for other in retrieval.spread(others, OPTIONS.previewed * count)
     )
     later: dict[int, list[int]] = {}
     for first, second in sorted(set(pairs)):
@@ -148,21 +136,19 @@ def _candidates(
     return later
 
 
-def _preview(descriptors: Mapping[int, DescriptorArray], candidates: tuple[int, Sequence[int]]) -> dict[PairId, int]:
+def _preview(
+    descriptors: Mapping[int, retrieval.DescriptorArray], candidates: tuple[int, Sequence[int]]
+) -> dict[PairId, int]:
     """Return for pairs of a photo how many of their largest features match, as if all had `preview_features`."""
     photo, others = candidates
-    counts = count_preview_matches(descriptors[photo], [descriptors[other] for other in others])
+    counts = retrieval.count_preview_matches(descriptors[photo], [descriptors[other] for other in others])
     fewest = [max(min(len(descriptors[photo]), len(descriptors[other])), OPTIONS.fewest_compared) for other in others]
     scaled = (round(count * OPTIONS.preview_features / few) for count, few in zip(counts, fewest, strict=True))
     return dict(zip(((photo, other) for other in others), scaled, strict=True))
 
 
 def match_probable_pairs(method: FeatureMethod, load: Callable[[], MatchGraph], run: RunContext) -> None:
-    """Match pairs of photos that look alike or lie beside each other, then pairs that these suggest.
-
-    Pairs of photos of an earlier run keep their matches. `load` reads the match graph as it is now. Errors as of
-    `fill_database`.
-    """
+    """Match pairs of photos that look alike or lie beside each other, then pairs that these suggest."""
     initial = load()
     known = run.earlier.known if run.earlier is not None else frozenset[str]()
     new = {photo for photo, image in initial.images.items() if image.name not in known}
@@ -181,10 +167,10 @@ def match_probable_pairs(method: FeatureMethod, load: Callable[[], MatchGraph], 
     run.record(matched_pairs=len(first) + len(second), rounds=[len(first), len(second)])
 
 
-def _descriptors(method: FeatureMethod, image: MatchedImage, run: RunContext) -> NDArray[np.uint8]:
+def _descriptors(method: FeatureMethod, image: MatchedImage, run: RunContext) -> ByteArray:
     """Return descriptors of the largest features of a photo: its own where they are SIFT, else those of its picture."""
     if method.sift is None:
-        return describe_picture(read_pixels(run.workspace.photos / image.name), OPTIONS.largest_features)
+        return retrieval.describe_picture(read_pixels(run.workspace.photos / image.name), OPTIONS.largest_features)
     with translate_errors("reading features"):
         return largest_descriptors(run.workspace.database, image.id, OPTIONS.largest_features)
 

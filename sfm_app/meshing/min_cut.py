@@ -105,9 +105,7 @@ def _left(forest: Forest, parent: int, down: int) -> int:
 
 
 @inlined_kernel
-def _grow(
-    forest: Forest, t: int, queue: NDArray[np.int32], waits: NDArray[np.bool_], last: int
-) -> tuple[int, int]:
+def _grow(forest: Forest, t: int, queue: NDArray[np.int32], waits: NDArray[np.bool_], last: int) -> tuple[int, int]:
     """Add free neighbors of a node to its tree; return the place of a neighbor in the other tree or -1, and `last`."""
     tree, depth, stamp = forest.tree, forest.depth, forest.stamp
     for k in range(4):

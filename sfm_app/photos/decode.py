@@ -25,7 +25,7 @@ from PIL.TiffImagePlugin import COMPRESSION_INFO, IMAGELENGTH, IMAGEWIDTH, Image
 from sfm_app.operating_system import find_in_wheel
 from sfm_app.photos.files import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
 from sfm_app.types import CameraPrior, GpsPosition
-from sfm_app.types.arrays import BoolArray
+from sfm_app.types.arrays import BoolArray, ByteArray
 from sfm_app.types.photos import EXIF, SEA_LEVEL, TAKE_OFF
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "PSD", "SGI", "PCX", "QOI", "TGA")
@@ -111,20 +111,15 @@ def _sensor_focal(details: Mapping[int, Any]) -> float:
 
 
 def gps_position(exif: Image.Exif, xmp: Mapping[str, str] = MappingProxyType({})) -> GpsPosition | None:
-    """Return the position by EXIF, or by XMP where EXIF has none or a coarser one.
-
-    None if it is missing, implausible, or 0, 0, which cameras without a fix write.
-    """
+    """Return the position by EXIF, else by XMP; None if implausible, or 0, 0, which cameras without a fix write."""
     entries: Mapping[int, Any] = exif.get_ifd(IFD.GPSInfo)
     drone = {name.partition(":")[2].lower(): text for name, text in xmp.items() if name.startswith(DRONES)}
-    given = [entries.get(tag) for tag in (GPS.GPSLatitude, GPS.GPSLongitude)]
-    latitude = _degrees(given[0], entries.get(GPS.GPSLatitudeRef), "NS", 90.0)
-    longitude = _degrees(given[1], entries.get(GPS.GPSLongitudeRef), "EW", 180.0)
-    north = _xmp_degrees(drone.get("gpslatitude", ""), "NS", 90.0)
-    east = _xmp_degrees(drone.get("gpslongitude") or drone.get("gpslongtitude", ""), "EW", 180.0)  # DJI misspelt it
-    known = latitude is not None and longitude is not None
-    if north and east and not (known and max(north[1], east[1]) >= max(map(_step_deg, given))):
-        latitude, longitude = north[0], east[0]
+    latitude = _degrees(entries.get(GPS.GPSLatitude), entries.get(GPS.GPSLatitudeRef), "NS", 90.0)
+    longitude = _degrees(entries.get(GPS.GPSLongitude), entries.get(GPS.GPSLongitudeRef), "EW", 180.0)
+    if latitude is None or longitude is None:
+        latitude = _xmp_degrees(drone.get("gpslatitude", ""), "NS", 90.0)
+        east = drone.get("gpslongitude") or drone.get("gpslongtitude", "")  # DJI misspelt it
+        longitude = _xmp_degrees(east, "EW", 180.0)
     if latitude is None or longitude is None or latitude == longitude == 0.0:
         return None
     altitude, zero = _find_altitude(entries, drone)
@@ -169,20 +164,14 @@ def xmp_entries(image: Image.Image, exif: Image.Exif | None = None) -> dict[str,
     return {name.decode(): value.decode(errors="replace").strip() for name, value in entries}
 
 
-def _xmp_degrees(text: str, sides: str, largest: float) -> tuple[float, float] | None:
-    """Return signed degrees of XMP and the step to which they are rounded."""
+def _xmp_degrees(text: str, sides: str, largest: float) -> float | None:
+    """Return signed degrees of XMP."""
     match = XMP_DEGREES.fullmatch(text)
     if not match or match[4] not in ("", *sides):
         return None
-    parts = [(float(part), 60.0**-k, len(part.partition(".")[2])) for k, part in enumerate(match.groups()[:3]) if part]
-    size = sum(abs(value) * unit for value, unit, _ in parts)
+    size = sum(abs(float(part)) * 60.0**-k for k, part in enumerate(match.groups()[:3]) if part)
     sign = -1.0 if text.startswith("-") or match[4] == sides[1] else 1.0
-    return (sign * size, min(unit * 10.0**-decimals for _, unit, decimals in parts)) if size <= largest else None
-
-
-def _step_deg(parts: Any) -> float:
-    """Return the step to which EXIF rounds degrees, minutes and seconds."""
-    return min(60.0**-k / max(getattr(part, "denominator", 1), 1) for k, part in enumerate(parts))
+    return sign * size if size <= largest else None
 
 
 def _number(text: str) -> float | None:
@@ -317,10 +306,7 @@ def _parse_jpeg(data: bytes) -> _Jpeg:
 
 
 def is_whole_jpeg(data: bytes) -> bool:
-    """Return whether the data of each scan of a JPEG end with its last block.
-
-    Where markers divide the data into intervals, they must be complete.
-    """
+    """Return whether the data of each scan of a JPEG end with its last block."""
     jpeg = _parse_jpeg(data)
     if jpeg.coding not in (0xC0, 0xC1, 0xC2):
         return jpeg.coding in (0, 0xC3)  # nothing shows the damage of others
@@ -604,7 +590,7 @@ def opaque_pixels(image: Image.Image) -> BoolArray:
     return np.asarray(image.convert("RGBA").getchannel("A")) >= OPAQUE
 
 
-def fill_masked(pixels: NDArray[np.uint8], used: BoolArray) -> NDArray[np.uint8]:
+def fill_masked(pixels: ByteArray, used: BoolArray) -> ByteArray:
     """Return an RGB photo whose masked pixels have the color of the nearest usable one, for interpolation."""
     if used.all() or not used.any():
         return pixels
@@ -653,7 +639,7 @@ def _to_eight_bit(image: Image.Image) -> Image.Image:
     return image if image.mode in ("RGB", "L") else image.convert("RGB")
 
 
-def _to_gray_levels(deep: NDArray[Any]) -> NDArray[np.uint8]:
+def _to_gray_levels(deep: NDArray[Any]) -> ByteArray:
     """Map gray of 16 bits or any other range to 256 levels."""
     values = np.nan_to_num(deep.astype(np.float64))
     low, high = values.min(), values.max()

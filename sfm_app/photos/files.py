@@ -101,11 +101,7 @@ NAMED_BYTES = 1_000_000
 
 
 def list_photos(folder: Path, out: Path, listed_in: Path | None = None, closed: Sequence[Path] = ()) -> dict[str, str]:
-    """Return the names that `list_files` does, each with the reason why it is no photo; most reasons are empty.
-
-    `listed_in` is a text file with the names to return instead, one per line. An InputError says that the folder does
-    not exist or cannot be read.
-    """
+    """Return the names of `list_files`, or those that a file lists, each with the reason why it is no photo or ""."""
     if not folder.is_dir():
         raise _bad_path_error(folder)
     if listed_in is not None:
@@ -117,11 +113,7 @@ def list_photos(folder: Path, out: Path, listed_in: Path | None = None, closed: 
 
 
 def list_files(folder: Path, out: Path, closed: Sequence[Path] = ()) -> list[str]:
-    """Return the names of all files below the folder, with forward slashes, sorted.
-
-    Hidden folders and links to folders are not entered; each counts as one file. The output folder `out` and the
-    folders `closed` are left out. An InputError says that the folder cannot be read.
-    """
+    """Return the files below a folder, sorted, without `out` and `closed`; hidden folders and links count as files."""
     try:
         next(folder.iterdir(), None)
     except OSError as err:
@@ -280,10 +272,7 @@ def _read_list(file: Path, folder: Path) -> list[str]:
 
 
 def _name_in(folder: Path, line: str, beside: Path) -> str:
-    """Return the name of a listed file as seen from the folder; the line itself where no file is meant.
-
-    Lists name files as seen from the folder, from the current folder, from their own, or in full.
-    """
+    """Return a listed file's name as seen from the folder; it may be as from here, from the list, or in full."""
     try:
         root = folder.resolve()
         for text in dict.fromkeys((line, line.strip())):

@@ -23,6 +23,8 @@ MOST_RATIO = 200
 """Unpacked size by packed size: photos hardly shrink, and bombs shrink a thousandfold."""
 MOST_NAME_BYTES = 255
 """Bytes of a name on common file systems."""
+PREVIEWS, NOTES = (".lrf", ".lrv", ".thm"), (".srt", ".xmp", ".txt")
+"""Suffixes of what cameras write beside videos: small copies of them, and texts."""
 MISSING_HINT = 'name photos, folders or a ZIP archive, with quotes around a name with spaces: "My photos"'
 ZIP_HINT = "unpack it yourself, and name the folder"
 
@@ -43,11 +45,15 @@ class Gathered:
         self.files[name], self.labels[name] = (place, member), label
 
     def videos(self, folder: Path) -> tuple[list[str], dict[str, str]]:
-        """Return the videos in the filled folder, and the films that a phone kept beside photos, with reasons."""
-        found = {name for name in self.files if is_video(read_head(folder / name))}
-        photos = {PurePosixPath(name.casefold()).with_suffix("") for name in self.files.keys() - found}
-        beside = {name for name in found if "/" in name and PurePosixPath(name.casefold()).with_suffix("") in photos}
-        return sorted(found - beside), dict.fromkeys(sorted(beside), "a video beside the photo of its name")
+        """Return the videos in the filled folder, and the films and previews beside others, with reasons."""
+        paths = {name: PurePosixPath(name.casefold()) for name in self.files}
+        previews = {name for name, path in paths.items() if "/" in name and path.suffix in PREVIEWS}
+        found = {name for name in self.files.keys() - previews if is_video(read_head(folder / name))}
+        others = [paths[name] for name in self.files.keys() - found]
+        photos = {path.with_suffix("") for path in others if path.suffix not in (*PREVIEWS, *NOTES)}
+        beside = {name for name in found if "/" in name and paths[name].with_suffix("") in photos}
+        left_out = dict.fromkeys(beside, "a video beside the photo of its name")
+        return sorted(found - beside), left_out | dict.fromkeys(previews, "a small copy of a video")
 
 
 def expand(inputs: Sequence[Path]) -> list[Path]:
@@ -68,7 +74,8 @@ def is_single(inputs: Sequence[Path], out: Path) -> bool:
         return len(inputs) == 1
     if path.is_dir():
         names = [name for name in list_files(path, out) if not PurePosixPath(name).name.startswith(".")]
-        return not names or not all(is_video(read_head(path / name)) for name in names)
+        films = [name for name in names if PurePosixPath(name).suffix.lower() not in (*PREVIEWS, *NOTES)]
+        return not films or not all(is_video(read_head(path / name)) for name in films)
     return not (path.is_file() and zipfile.is_zipfile(path))
 
 
@@ -108,7 +115,7 @@ def find(inputs: Sequence[Path], out: Path, masks: str = "") -> Gathered:
 
 def fill(target: Path, found: Gathered, spread: ParallelMap) -> None:
     """Fill a folder with the files of all inputs, unless it holds them; an InputError names a damaged archive."""
-    record = target.with_name(f"{target.name}.json")
+    record = _record(target)
     places = sorted({str(place) for place, _ in found.files.values()})
     digests = dict(zip(places, spread(lambda place: digest(Path(place)), places), strict=True))
     made_from = fingerprint({name: (digests[str(place)], member) for name, (place, member) in found.files.items()})
@@ -127,6 +134,16 @@ def fill(target: Path, found: Gathered, spread: ParallelMap) -> None:
             _unpack(place, members, draft)
     with replace_atomically(record) as path:
         path.write_text(json.dumps({"made_from": made_from}), encoding="utf-8", newline="\n")
+
+
+def remove(target: Path) -> None:
+    """Remove a folder that `fill` made."""
+    _record(target).unlink(missing_ok=True)
+    shutil.rmtree(target, ignore_errors=True)
+
+
+def _record(target: Path) -> Path:
+    return target.with_name(f"{target.name}.json")
 
 
 @contextlib.contextmanager

@@ -13,15 +13,7 @@ import numpy as np
 from PIL import Image
 
 from sfm_app.errors import InputError
-from sfm_app.photos.decode import (
-    LOSSY,
-    UnreadableError,
-    opaque_pixels,
-    orientation,
-    read_picture,
-    rotate_to_sensor,
-    undo_exif_orientation,
-)
+from sfm_app.photos import decode
 from sfm_app.photos.files import list_files, resolve_file
 from sfm_app.types import Photo, UnusablePhoto
 from sfm_app.types.arrays import BoolArray
@@ -60,10 +52,7 @@ def list_masks(masks: str, photos: Path, out: Path) -> list[str]:
 
 
 def assign_masks(photos: Sequence[Photo], names: Collection[str], *, for_all: bool = False) -> list[Photo]:
-    """Return the photos with the names of their masks; empty names where they have none.
-
-    The one file of `for_all` is the mask of all, and so is one that is alone in its folder and has no photo's name.
-    """
+    """Return the photos with their masks, empty without; one of `for_all`, or alone in its folder, masks all."""
     visible = {name for name in names if not PurePosixPath(name).name.startswith(".")}
     assigned = [replace(photo, mask=_find_mask(photo.path, visible)) for photo in photos]
     is_alone = len(visible) == 1 and "/" not in "".join(visible) and not any(photo.mask for photo in assigned)
@@ -128,16 +117,16 @@ def _load_fitted_mask(photo: Photo, folder: Path, masks: Path) -> BoolArray:
     try:
         place = resolve_file(masks, photo.mask)
         if isinstance(place, str):
-            raise UnreadableError(place)
-        picture = read_picture(place)
-        mask = undo_exif_orientation(_binarize(picture.image), orientation(picture.exif))
+            raise decode.UnreadableError(place)
+        picture = decode.read_picture(place)
+        mask = decode.undo_exif_orientation(_binarize(picture.image), decode.orientation(picture.exif))
         size = (photo.height, photo.width) if photo.turn_deg in (90, 270) else (photo.width, photo.height)
         if not _has_same_aspect(mask.size, size):
             mask = _orient_mask(photo, size, mask, folder)
-    except UnreadableError as err:
+    except decode.UnreadableError as err:
         raise InputError(f"the mask {photo.mask} cannot be used: {err}", hint=MASK_HINT) from err
     fitted = mask if mask.size == size else mask.resize(size, Image.Resampling.NEAREST)
-    return np.asarray(rotate_to_sensor(fitted, photo.turn_deg)) > 0
+    return np.asarray(decode.rotate_to_sensor(fitted, photo.turn_deg)) > 0
 
 
 def _load_opaque(photo: Photo, folder: Path) -> BoolArray:
@@ -145,21 +134,23 @@ def _load_opaque(photo: Photo, folder: Path) -> BoolArray:
     source = resolve_file(folder, photo.path)
     if isinstance(source, str):
         raise InputError(f"{photo.label} has changed while it was read: {source}")
-    picture = read_picture(source)
-    opaque = undo_exif_orientation(Image.fromarray(opaque_pixels(picture.image)), orientation(picture.exif))
+    picture = decode.read_picture(source)
+    opaque = decode.undo_exif_orientation(
+        Image.fromarray(decode.opaque_pixels(picture.image)), decode.orientation(picture.exif)
+    )
     upright = (photo.height, photo.width) if photo.turn_deg in (90, 270) else (photo.width, photo.height)
-    return np.asarray(rotate_to_sensor(opaque.resize(upright, Image.Resampling.NEAREST), photo.turn_deg))
+    return np.asarray(decode.rotate_to_sensor(opaque.resize(upright, Image.Resampling.NEAREST), photo.turn_deg))
 
 
 def _orient_mask(photo: Photo, size: tuple[int, int], mask: Image.Image, folder: Path) -> Image.Image:
     """Apply the photo's EXIF orientation to a mask that was painted on the pixels as stored in the file."""
     if _has_same_aspect(mask.size[::-1], size):
         source = resolve_file(folder, photo.path)
-        stored = orientation(read_picture(source).exif) if isinstance(source, Path) else 1
+        stored = decode.orientation(decode.read_picture(source).exif) if isinstance(source, Path) else 1
         if stored >= 5:  # these swap width and height
-            return undo_exif_orientation(mask, stored)
+            return decode.undo_exif_orientation(mask, stored)
     width, height = mask.size
-    raise UnreadableError(f"it has {width} x {height} pixels, its photo {size[0]} x {size[1]}")
+    raise decode.UnreadableError(f"it has {width} x {height} pixels, its photo {size[0]} x {size[1]}")
 
 
 def _has_same_aspect(one: tuple[int, int], other: tuple[int, int]) -> bool:
@@ -177,7 +168,7 @@ def _binarize(image: Image.Image) -> Image.Image:
         channels = np.asarray(plain.convert("RGBA"))
         levels, opaque = channels[..., :3].max(axis=2), channels[..., 3] >= NEAR_BLACK
     brightest = float(levels.max())
-    is_labels = brightest < NEAR_BLACK and image.format not in LOSSY  # 0 and 1, say
+    is_labels = brightest < NEAR_BLACK and image.format not in decode.LOSSY  # 0 and 1, say
     return _black_and_white((levels > (0.0 if is_labels else max(brightest, NEAR_BLACK) / 4.0)) & opaque)
 
 

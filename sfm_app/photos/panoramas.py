@@ -15,7 +15,7 @@ from sfm_app.camera.models import panorama_camera
 from sfm_app.camera.perspective_views import PerspectiveView, cover_rays
 from sfm_app.camera.projection import RAY
 from sfm_app.photos.decode import DecodedPhoto, UnreadableError, xmp_entries
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, ByteArray, FloatArray
 
 # Recognition of equirectangular photos, whose columns are longitudes and whose rows are latitudes. Ours.
 # Cameras and stitchers name the projection in the file (Google's Photo Sphere metadata, `GPano`). Without metadata, a
@@ -23,8 +23,7 @@ from sfm_app.types.arrays import FloatArray
 # each show one point: zenith and nadir.
 
 
-@dataclass(frozen=True, slots=True)
-class PanoramaOptions:
+class OPTIONS:
     """Constants of panoramas. Recognition: chosen on 2:1 parts of real photos and on rendered panoramas."""
 
     whole: float = 0.995
@@ -50,9 +49,6 @@ class PanoramaOptions:
     """Rows and columns of a panorama whose rays the painted views cover. Chosen by hand."""
 
 
-OPTIONS = PanoramaOptions()
-
-
 def is_panorama(picture: DecodedPhoto, upright: Image.Image) -> bool:
     """Return whether a photo is a full panorama; raise an UnreadableError for another projection or a part of one."""
     entries = read_panorama_entries(picture.image)
@@ -66,9 +62,7 @@ def is_panorama(picture: DecodedPhoto, upright: Image.Image) -> bool:
         degrees = f"{360 * wide:.0f} x {180 * high:.0f} degrees"
         raise UnreadableError(f"a panorama of {degrees}: only full ones of 360 x 180 degrees can be used")
     if not _is_twice_as_wide(upright.size):
-        raise UnreadableError(
-            "a part of a panorama: its metadata claims the whole sphere, but it is not twice as wide as high"
-        )
+        raise UnreadableError("a part of a panorama: it is not twice as wide as high")
     return True
 
 
@@ -89,7 +83,7 @@ def looks_like_panorama(upright: Image.Image) -> bool:
     return bool(max(steps[0], steps[-1]) <= OPTIONS.pole_share * steps.max()) and _borders_continue(pixels)
 
 
-def _borders_continue(pixels: NDArray[np.float64]) -> bool:
+def _borders_continue(pixels: FloatArray) -> bool:
     """Return whether the last column continues in the first, and far better than in any other."""
     width, edge = pixels.shape[1], (pixels[:, :1], pixels[:, -1:])
     if min(float(np.std(column.mean(axis=2))) for column in edge) < OPTIONS.min_contrast:
@@ -101,7 +95,7 @@ def _borders_continue(pixels: NDArray[np.float64]) -> bool:
     return bool(seam <= OPTIONS.seam_steps * np.median(steps) and seam <= OPTIONS.seam_share * others)
 
 
-def _difference(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def _difference(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the mean absolute difference (N,) of columns (H, N, 3)."""
     return np.asarray(np.mean(np.abs(a - b), axis=(0, 2)), np.float64)
 
@@ -119,9 +113,7 @@ def _covered_share(entries: dict[str, str], side: str) -> float:
         return 1.0
 
 
-def resample(
-    photo: NDArray[np.uint8], at: NDArray[np.floating[Any]], size: tuple[int, int], wraps: bool = False
-) -> NDArray[np.uint8]:
+def resample(photo: ByteArray, at: NDArray[np.floating[Any]], size: tuple[int, int], wraps: bool = False) -> ByteArray:
     """Return a photo (H, W, 3) at given positions by cubic interpolation; outside, the border is repeated.
 
     `at` (H, W, 2) are pixels of the photo at its own size (width, height), centers at +0.5; it may be scaled down. With
@@ -138,7 +130,7 @@ def resample(
     return np.asarray(cv2.remap(photo, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def shrink(photo: NDArray[np.uint8], share: float) -> NDArray[np.uint8]:
+def shrink(photo: ByteArray, share: float) -> ByteArray:
     """Return a photo (H, W, 3) scaled down to a share of its size by averaging, to avoid aliasing; never enlarged."""
     if share >= 1.0:
         return photo
@@ -173,13 +165,13 @@ class PanoramaViews:
         """Focal length of the views in pixels."""
         return self.side_px / (2.0 * math.tan(math.radians(OPTIONS.field_deg / 2.0)))
 
-    def render(self, panorama: NDArray[np.uint8], view: int) -> NDArray[np.uint8]:
+    def render(self, panorama: ByteArray, view: int) -> ByteArray:
         """Return the picture (side, side, 3) of a view of the panorama (H, W, 3), possibly scaled by `shrink`."""
         row, column = np.mgrid[: self.side_px, : self.side_px]
         at = self.to_panorama(np.column_stack([column.ravel(), row.ravel()]) + 0.5, view)
         return resample(panorama, at.reshape(self.side_px, self.side_px, 2), self.size, wraps=True)
 
-    def shrink(self, panorama: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def shrink(self, panorama: ByteArray) -> ByteArray:
         """Return the panorama (H, W, 3) in the resolution of the views, to avoid aliasing."""
         return shrink(panorama, 2.0 * math.pi * self.focal_px / self.size[0])
 
@@ -187,7 +179,7 @@ class PanoramaViews:
         """Return (N, 2) pixels of the panorama for (N, 2) pixels of a view."""
         return project(self._rays(x, view), panorama_camera(self.size))
 
-    def is_nearest(self, x: FloatArray, view: int) -> NDArray[np.bool_]:
+    def is_nearest(self, x: FloatArray, view: int) -> BoolArray:
         """Return (N,) whether no other view's axis is nearer to each of the (N, 2) pixels of a view."""
         return np.asarray(np.argmax(self._rays(x, view) @ self.rotations[:, 2].T, axis=1) == view)
 
@@ -226,14 +218,14 @@ def panorama_parts(size: tuple[int, int]) -> list[PerspectiveView]:
     return cover_rays(rays, size[0] / (2.0 * np.pi), size[0])
 
 
-def show_part(panorama: NDArray[np.uint8], part: PerspectiveView) -> NDArray[np.uint8]:
+def show_part(panorama: ByteArray, part: PerspectiveView) -> ByteArray:
     """Return the picture (h, w, 3) of a view of a panorama (H, W, 3)."""
     height, width = panorama.shape[:2]
     at = part.locate(partial(project, camera=panorama_camera((width, height))))
     return resample(panorama, at, (width, height), wraps=True)
 
 
-def mask_part(used: NDArray[np.bool_], part: PerspectiveView) -> NDArray[np.bool_]:
+def mask_part(used: BoolArray, part: PerspectiveView) -> BoolArray:
     """Return the usable pixels (h, w) of a view of a panorama with usable pixels (H, W)."""
     height, width = used.shape
     at = part.locate(partial(project, camera=panorama_camera((width, height))))

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -31,6 +31,7 @@ from sfm_app.photos.panoramas import is_panorama
 from sfm_app.photos.selection import PhotoStats, measure_photo
 from sfm_app.settings import PhotoSettings
 from sfm_app.types import Frame, GivenCameras, Photo, UnusablePhoto
+from sfm_app.types.arrays import ByteArray, FloatArray, IndexArray
 from sfm_app.types.camera import EQUIRECTANGULAR, PERSPECTIVE
 from sfm_app.types.photos import FILE, SEA_LEVEL, TAKE_OFF
 
@@ -40,8 +41,7 @@ from sfm_app.types.photos import FILE, SEA_LEVEL, TAKE_OFF
 # background or an overexposed sky does not end like that.
 
 
-@dataclass(frozen=True, slots=True)
-class BarOptions:
+class BARS:
     """Constants of the detection of bars; sides are those of the picture across a bar."""
 
     tolerance: int = 8
@@ -66,9 +66,6 @@ class BarOptions:
     """Largest difference of the edges of pictures of one size."""
     same_share: float = 0.01
     """The same, as a share of the longer side; the larger one counts."""
-
-
-BARS = BarOptions()
 
 
 def shown_part(picture: Image.Image) -> Frame | None:
@@ -98,10 +95,7 @@ def unify_frames(photos: Sequence[Photo]) -> list[Photo]:
     if len(barred) == 1 and 2 * sum(not photo.shown for photo in photos) <= len(photos):
         numbers = [*barred] * len(photos)
     medians = [np.median([_edges(frame) for frame in frames], axis=0) for frames in clusters]
-    return [
-        replace(photo, shown=_frame_within(photo, medians[number]))
-        for photo, number in zip(photos, numbers, strict=True)
-    ]
+    return [replace(one, shown=_frame_within(one, medians[k])) for one, k in zip(photos, numbers, strict=True)]
 
 
 def _cluster_frames(photos: Sequence[Photo]) -> tuple[list[list[Frame]], list[int]]:
@@ -120,19 +114,19 @@ def _cluster_frames(photos: Sequence[Photo]) -> tuple[list[list[Frame]], list[in
     return clusters, numbers
 
 
-def _frame_within(photo: Photo, edges: NDArray[np.float64]) -> Frame | None:
+def _frame_within(photo: Photo, edges: FloatArray) -> Frame | None:
     """Return the frame with these edges; None if it is the whole photo."""
     left, top, right, bottom = (round(float(value)) for value in edges)
     whole = (left, top, right, bottom) == (0, 0, photo.width, photo.height)
     return None if whole else (left, top, right - left, bottom - top)
 
 
-def _edges(frame: Frame) -> NDArray[np.int64]:
+def _edges(frame: Frame) -> IndexArray:
     left, top, width, height = frame
     return np.array([left, top, left + width, top + height])
 
 
-def _bar_thickness(lines: NDArray[np.uint8]) -> int:
+def _bar_thickness(lines: ByteArray) -> int:
     """Return how many of the first lines of (N, M, 3) form a bar."""
     color = np.median(lines[0], axis=0).astype(np.int16)
     most = int(BARS.max_share * len(lines))
@@ -148,7 +142,7 @@ def _bar_thickness(lines: NDArray[np.uint8]) -> int:
     return first if 0 < edge <= first + BARS.blur_px else edge
 
 
-def _differing_share(line: NDArray[np.uint8], color: NDArray[np.int16], levels: int) -> float:
+def _differing_share(line: ByteArray, color: NDArray[np.int16], levels: int) -> float:
     """Return the share of a line (M, 3) that differs from a color by more than `levels`."""
     return float(np.mean(np.max(np.abs(line.astype(np.int16) - color), axis=1) > levels))
 
@@ -253,10 +247,7 @@ def _complete_panoramas(photos: Sequence[Photo]) -> list[Photo]:
     counts = Counter((photo.width, photo.height) for photo in photos)
     panoramas = Counter((photo.width, photo.height) for photo in photos if photo.projection == EQUIRECTANGULAR)
     sizes = {size for size, count in panoramas.items() if count > counts[size] / 2 and size[0] == 2 * size[1]}
-    return [
-        replace(photo, projection=EQUIRECTANGULAR) if (photo.width, photo.height) in sizes else photo
-        for photo in photos
-    ]
+    return [replace(one, projection=EQUIRECTANGULAR) if (one.width, one.height) in sizes else one for one in photos]
 
 
 def with_one_zero(photos: Sequence[Photo]) -> list[Photo]:

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.files import fingerprint, load_arrays, replace_atomically
 from sfm_app.settings import PhotoSettings
 from sfm_app.types import Photo, UnusablePhoto
+from sfm_app.types.arrays import Float32Array
 
 logger = logging.getLogger("sfm_app")
 
@@ -25,8 +25,7 @@ READERS = ("sfm-app", "pillow", "opencv-contrib-python-headless")
 """Packages that decode and measure."""
 
 
-@dataclass(frozen=True, slots=True)
-class SelectionOptions:
+class OPTIONS:
     """Constants of the statistics of photos and of the choice by them."""
 
     analysis_px: int = 1024
@@ -58,15 +57,12 @@ class SelectionOptions:
     """A size is odd if a smaller share of the photos has it."""
 
 
-OPTIONS = SelectionOptions()
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotoStats:
     """A usable photo and its image statistics."""
 
     photo: Photo
-    thumbnail: NDArray[np.float32]
+    thumbnail: Float32Array
     """(SIDE_PX, SIDE_PX) upright and gray."""
     blur: float = 0.0
     """Share of their slope that edges keep after one more blur; near 1 if the photo is blurred."""
@@ -106,7 +102,7 @@ def flat_share(picture: Image.Image) -> float:
     return float(np.mean(low.min(axis=2) == high.max(axis=2)))
 
 
-def _edge_slope(image: NDArray[np.float32], axis: int) -> float:
+def _edge_slope(image: Float32Array, axis: int) -> float:
     return float(np.percentile(np.abs(np.diff(image, axis=axis)), OPTIONS.edge_percentile))
 
 
@@ -155,10 +151,7 @@ def _fingerprint_reading(options: PhotoSettings) -> str:
 
 
 def drop_duplicates(stats: Sequence[PhotoStats]) -> tuple[list[Photo], list[UnusablePhoto]]:
-    """Return one photo per picture, and its copies, in the given order.
-
-    Photos with a mask stay, then those of more pixels, with EXIF, and of larger files.
-    """
+    """Return one photo per picture, masked, large, with EXIF or of many bytes, and its copies, in the given order."""
     from scipy.spatial import cKDTree
 
     photos = [one.photo for one in stats]

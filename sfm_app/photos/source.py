@@ -50,12 +50,15 @@ class Source:
     """What the user calls each file where several inputs were gathered."""
     videos: Sequence[str] = ()
     """Names of the videos among gathered files."""
+    missing: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """Photos that a file of positions names and that are not there, by the file."""
 
     @property
     def fingerprint(self) -> str:
         """Hash of the path, the files and the masks; gathered files move with the output folder."""
         path = self.named or str(self.path.resolve())
-        return fingerprint(path, self.files, self.left_out, self.masks, self.one_mask, self.positions, self.videos)
+        places = self.positions, self.missing
+        return fingerprint(path, self.files, self.left_out, self.masks, self.one_mask, places, self.videos)
 
     def label(self, name: str) -> str:
         """Return what the user calls a file, or a frame of a video."""
@@ -90,10 +93,7 @@ class Source:
             if stamp != self.stamps[path]:
                 change = "is gone" if stamp is None else "has changed"
                 name = path.relative_to(self.path).as_posix() if path.is_relative_to(self.path) else ""
-                raise InputError(
-                    f"{self.named.get(name, path)} {change} since the run began",
-                    hint="run again once the files are restored",
-                )
+                raise InputError(f"{self.named.get(name, path)} {change} since the run began", hint="restore it")
 
 
 def read_source(path: Path, out: Path, options: PhotoSettings, spread: ParallelMap) -> Source:

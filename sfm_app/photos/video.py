@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sfm_app.photos.decode import UnreadableError
 from sfm_app.photos.files import container, read_head
-from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.types.arrays import BoolArray, Float32Array, FloatArray, IndexArray
 
 if TYPE_CHECKING:  # PyAV takes a tenth of a second to load
     from av import VideoFrame, VideoStream
@@ -23,7 +23,6 @@ if TYPE_CHECKING:  # PyAV takes a tenth of a second to load
     from av.filter import Graph
 
 Picture = NDArray[np.uint8]
-Float32Array = NDArray[np.float32]
 
 BLURRED = 0.5
 """A frame with less than this share of its neighbors' sharpness is blurred."""
@@ -99,10 +98,7 @@ class Video:
         return self.seconds + reordered_s < 0.95 * self.claimed_s
 
     def small_frames(self) -> Iterator[tuple[int, Picture]]:
-        """Yield gray pictures of about 30 frames per second with their numbers, as stored: not turned.
-
-        Their longer side has at most 480 pixels, and all have the size of the first.
-        """
+        """Yield gray pictures of about 30 frames per second, at most 480 px long, not turned, with their numbers."""
         last = -1
         size: tuple[int, int] | None = None
         for number, frame in self._read_frames():
@@ -265,8 +261,7 @@ def _pull(graph: "Graph", frame: "VideoFrame | None") -> Iterator["VideoFrame"]:
             return
 
 
-@dataclass(frozen=True, slots=True)
-class TrackingOptions:
+class OPTIONS:
     """Constants of the measurement of motion and sharpness."""
 
     step: float = 0.05
@@ -286,9 +281,6 @@ class TrackingOptions:
     """Window of the Lucas-Kanade method."""
     levels: int = 3
     """Its pyramid levels."""
-
-
-OPTIONS = TrackingOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -425,11 +417,11 @@ def sharpest_frames(path: FloatArray, sharpness: FloatArray, spacing: float) -> 
     return chosen, candidates
 
 
-def _sharpest_frame(sharpness: FloatArray, frames: NDArray[np.int64]) -> int:
+def _sharpest_frame(sharpness: FloatArray, frames: IndexArray) -> int:
     return int(frames[np.argmax(sharpness[frames])])
 
 
-def _nearby_frames(path: FloatArray, moment: int, target: float, reach: float, first: int) -> NDArray[np.int64]:
+def _nearby_frames(path: FloatArray, moment: int, target: float, reach: float, first: int) -> IndexArray:
     """Return the consecutive frames around a moment whose motion is within `reach` steps of the target."""
     outside = np.abs(path - target) > reach
     outside[:first] = True

@@ -32,8 +32,7 @@ LOOKS_ALIKE = "equal things in different places"
 # from loops of other pairs, two matches determine the direction of translation.
 
 
-@dataclass(frozen=True, slots=True)
-class GuidedOptions:
+class GUIDED:
     """Poses with a known rotation; docs/algorithms/relative-poses.md."""
 
     samples: int = 200
@@ -46,9 +45,6 @@ class GuidedOptions:
     """Share of the inliers that must lie in front of both cameras. Measured on photo sets with truth."""
     max_rotation_deg: float = 2.0
     """Largest change of the rotation by refinement. Measured on photo sets with truth."""
-
-
-GUIDED = GuidedOptions()
 
 
 def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> RelativePose | None:
@@ -96,8 +92,7 @@ def sample_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> Flo
     return best if front >= behind else -best
 
 
-@dataclass(frozen=True, slots=True)
-class GraphOptions:
+class OPTIONS:
     """Which pairs stay; docs/algorithms/relative-poses.md."""
 
     min_in_front: float = 0.75
@@ -115,8 +110,6 @@ class GraphOptions:
     weak_factor: float = 2.0
     """A pair with fewer inliers than this multiple of the minimum needs a loop of other pairs. Chosen by hand."""
 
-
-OPTIONS = GraphOptions()
 
 NO_POSES: Mapping[PairId, RelativePose] = MappingProxyType({})
 
@@ -147,23 +140,17 @@ def build_pose_graph(
     cameras = {photo: evidence.camera(photo) for photo in matches.images}
     look_alikes = find_look_alikes(matches, poses if options.look_alikes else {}, cameras)
     _drop_pairs([pair for join in look_alikes.joins for pair in join.pairs], LOOKS_ALIKE, poses, dropped)
-    estimator.rotations, angles = average_pair_rotations(
-        poses, {pair for pair, fit in views.fits.items() if fit.degeneracy}
-    )
+    estimator.rotations, angles = average_pair_rotations(poses, {p for p, fit in views.fits.items() if fit.degeneracy})
     _drop_pairs(_contradicting_pairs(poses, angles), CONTRADICTS, poses, dropped)
 
     rest = [pair for pair in _pairs_without_pose(matches.matches, poses, known) if dropped.get(pair) != LOOKS_ALIKE]
-    for pair, pose in zip(
-        rest, run_map(estimator.from_rotations, rest, "relative poses by known rotations"), strict=True
-    ):
+    for pair, pose in zip(rest, run_map(estimator.from_rotations, rest, "poses by known rotations"), strict=True):
         if pose is not None and not look_alikes.is_look_alike(pair, matches.matches[pair][pose.inliers]):
             poses[pair] = pose
             dropped.pop(pair, None)
     poses = dict(sorted(poses.items()))
     _drop_pairs(_unconfirmed_pairs(poses, OPTIONS.weak_factor * options.min_inliers), UNCONFIRMED, poses, dropped)
-    doubtful = (
-        replace(join, pairs=tuple(pair for pair in join.pairs if pair in poses)) for join in look_alikes.doubtful
-    )
+    doubtful = (replace(join, pairs=tuple(p for p in join.pairs if p in poses)) for join in look_alikes.doubtful)
     return PoseGraph(poses, dropped, _groups(poses), look_alikes.joins, tuple(join for join in doubtful if join.pairs))
 
 

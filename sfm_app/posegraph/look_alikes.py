@@ -11,20 +11,18 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.bearings import bearings, depths_along, project
 from sfm_app.geometry.epipolar import FIRST, SECOND, depths
 from sfm_app.posegraph.rotations import DisjointGroups, average_rotations, partners_of
 from sfm_app.types import Calibration, LookAlikes, MatchGraph, PairId, RelativePose
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 # Coverage and backbone. Neighbors on a walk share most of the content that the set knows of either. Photos of equal
 # things in different places share only the things, however many matches these give, and nothing around them.
 
 
-@dataclass(frozen=True, slots=True)
-class LookAlikeOptions:
+class OPTIONS:
     """Detection of look-alikes; docs/algorithms/look-alikes.md has the measurements."""
 
     min_other_photos: int = 2
@@ -67,9 +65,6 @@ class LookAlikeOptions:
     """Cells along the longer side of a photo. Measured."""
 
 
-OPTIONS = LookAlikeOptions()
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Visibility:
     """Inliers of all pairs, and the keypoints and cells of the photos that they are in."""
@@ -91,13 +86,11 @@ def compute_visibility(matches: MatchGraph, poses: Mapping[PairId, RelativePose]
         for photo, column in zip(pair, inliers.T, strict=True):
             partners[photo][np.unique(column)] += 1
     images = matches.images
-    cells = {
-        photo: cell_numbers(matches.keypoints[photo], images[photo].width, images[photo].height) for photo in photos
-    }
+    cells = {k: cell_numbers(matches.keypoints[k], images[k].width, images[k].height) for k in photos}
     return Visibility(rows, partners, cells)
 
 
-def cell_numbers(x: NDArray[np.float64], width: int, height: int) -> IndexArray:
+def cell_numbers(x: FloatArray, width: int, height: int) -> IndexArray:
     """Return the numbers (N,) of the cells of pixels (N, 2) inside a photo, less than (`cells` + 1) squared."""
     columns, lines = (x // (max(width, height) / OPTIONS.cells)).astype(np.int64).T
     return np.asarray(lines * (OPTIONS.cells + 1) + columns, np.int64)
@@ -131,9 +124,7 @@ def backbone(covered: Mapping[PairId, float]) -> set[PairId]:
         joining = groups.join(a, b)
         inside = set(joining)
         for photo in joining:
-            across = (
-                other for other in partners[photo] if other not in inside and groups.name[other] == groups.name[a]
-            )
+            across = (b for b in partners[photo] if b not in inside and groups.name[b] == groups.name[a])
             joined = ((min(photo, other), max(photo, other)) for other in across)
             chosen |= {pair for pair in joined if covered[pair] >= OPTIONS.backbone_share * covered[a, b]}
     return chosen
@@ -238,13 +229,13 @@ class Depths:
         return np.asarray(points[expected], np.int64)
 
 
-def is_well_inside(x: FloatArray, width: int, height: int) -> NDArray[np.bool_]:
+def is_well_inside(x: FloatArray, width: int, height: int) -> BoolArray:
     """Return a mask (N,) of the pixels (N, 2) inside a photo and off its border; NaN is outside."""
     size = np.array([width, height], np.float64)
     return np.asarray(((x > OPTIONS.border * size) & (x < (1.0 - OPTIONS.border) * size)).all(axis=1))
 
 
-def is_matched_again(size_ratios: FloatArray, cosines: FloatArray) -> NDArray[np.bool_]:
+def is_matched_again(size_ratios: FloatArray, cosines: FloatArray) -> BoolArray:
     """Return a mask (N,) of the points that look alike in two photos, by ratios of sizes and cosines of rays."""
     alike = (
         (size_ratios < OPTIONS.max_scale)
@@ -357,9 +348,7 @@ def _build_tracks(visibility: Visibility, pairs: Iterable[PairId]) -> FeatureTra
     joined = np.zeros(count, np.bool_)
     joined[first] = joined[second] = True
     names[~joined] = -1
-    return FeatureTracks(
-        {photo: names[start : start + len(visibility.partners[photo])] for photo, start in starts.items()}
-    )
+    return FeatureTracks({k: names[start : start + len(visibility.partners[k])] for k, start in starts.items()})
 
 
 def group_doubted_pairs(doubted: Iterable[PairId], trusted: Iterable[PairId]) -> list[tuple[PairId, ...]]:
@@ -400,15 +389,9 @@ def _judge_join(
     join: tuple[PairId, ...], partners: Mapping[int, set[int]], rotations: Mapping[int, FloatArray], places: Depths
 ) -> tuple[LookAlikes, str]:
     claimed = partners_of(join)
-    counts = [
-        count_missing_cells(photo, claimed[photo], partners[photo], places)
-        for photo in sorted(claimed)
-        if photo in partners
-    ]
+    counts = [count_missing_cells(k, claimed[k], partners[k], places) for k in sorted(claimed) if k in partners]
     expected, missing = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
-    shares = [
-        missing_here / expected_here for expected_here, missing_here in counts if expected_here >= OPTIONS.min_cells
-    ]
+    shares = [lost / due for due, lost in counts if due >= OPTIONS.min_cells]
     same_turn = _rotation_gap_deg(join, rotations, places) <= OPTIONS.same_rotation_deg
     limit = OPTIONS.max_missing_same_rotation if same_turn else OPTIONS.max_missing
     alike = len(shares) >= OPTIONS.min_photos and float(np.percentile(shares, OPTIONS.low_percentile)) > limit

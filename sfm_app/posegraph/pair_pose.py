@@ -1,27 +1,14 @@
 """The relative pose of one pair of photos from F and two cameras, and the kind of the pair."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.bearings import bearings
 from sfm_app.fundamental.degeneracy import DEGENERACY, dominant_homography, transfer_distance
 from sfm_app.fundamental.refits import solve_cholesky
-from sfm_app.geometry.epipolar import (
-    FIRST,
-    SECOND,
-    cross_matrix,
-    decompose_essential,
-    eight_point,
-    fit_rays,
-    gradients,
-    nearest_essential,
-    pixels_per_radian,
-    rotation_residuals,
-)
+from sfm_app.geometry import epipolar
 from sfm_app.geometry.least_squares import DECREASE, INCREASE, DampingRange
 from sfm_app.geometry.poses import (
     POSE_DOF,
@@ -35,7 +22,7 @@ from sfm_app.geometry.poses import (
 )
 from sfm_app.jit import kernel
 from sfm_app.types import Calibration, EpipolarFit, EpipolarGeometry, RelativePose
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray
 from sfm_app.types.camera import PERSPECTIVE
 
 # Initial poses. With a long lens, matches determine the directions of epipolar lines, but hardly where they meet: the
@@ -43,8 +30,7 @@ from sfm_app.types.camera import PERSPECTIVE
 # the turn of a camera that looks at the same scene, so several turns are tried.
 
 
-@dataclass(frozen=True, slots=True)
-class PoseOptions:
+class OPTIONS:
     """Thresholds for the pose of a pair; docs/algorithms/relative-poses.md."""
 
     turns_deg: tuple[float, ...] = (-55.0, -30.0, -12.0, 12.0, 30.0, 55.0)
@@ -78,9 +64,6 @@ class PoseOptions:
     """Relative decrease of the cost below which they end. Chosen by hand."""
 
 
-OPTIONS = PoseOptions()
-
-
 def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Yield up to four R and t that explain inliers (N, 4), points of the plane z = 1 in both views, by one plane."""
     if len(used) < OPTIONS.min_matches:
@@ -110,7 +93,7 @@ def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray,
     if min(lengths) <= 1e-12 * max(*lengths, 1e-300):
         return
     roll = np.arctan2(-g2[1], -g2[0]) - np.arctan2(g1[1], g1[0])
-    K = cross_matrix(np.append(g1 / lengths[0], 0.0))
+    K = epipolar.cross_matrix(np.append(g1 / lengths[0], 0.0))
     angles = np.radians(OPTIONS.turns_deg)[:, None, None]
     upright = np.array([[np.cos(roll), -np.sin(roll), 0.0], [np.sin(roll), np.cos(roll), 0.0], [0.0, 0.0, 1.0]])
     turns = upright @ (np.eye(3) + np.sin(angles) * K + (1.0 - np.cos(angles)) * (K @ K))  # Rodrigues
@@ -204,7 +187,7 @@ class Pair:
         """Return R and t from F and the cameras, before refinement."""
         inliers, E = self.lines[fit.inliers], self.essential_matrix(fit)
         chosen = _screen(inliers)
-        poses = decompose_essential(nearest_essential(E))
+        poses = epipolar.decompose_essential(epipolar.nearest_essential(E))
         return max(poses, key=lambda pose: int(np.count_nonzero(is_in_front(chosen, *pose))))
 
     def essential_matrix(self, fit: EpipolarGeometry) -> FloatArray:
@@ -212,15 +195,17 @@ class Pair:
         (first, second), inliers = self.cameras, self.lines[fit.inliers]
         is_wide = any(camera.projection != PERSPECTIVE for camera in self.cameras)
         if is_wide or not isinstance(fit, EpipolarFit):  # by eight points with errors in pixels
-            E = fit_rays(inliers[:, FIRST], inliers[:, SECOND])
+            E = epipolar.fit_rays(inliers[:, epipolar.FIRST], inliers[:, epipolar.SECOND])
             for _ in range(OPTIONS.reweighted_fits):
-                E = fit_rays(inliers[:, FIRST], inliers[:, SECOND], gradients(E, inliers) ** -2.0)
+                E = epipolar.fit_rays(
+                    inliers[:, epipolar.FIRST], inliers[:, epipolar.SECOND], epipolar.gradients(E, inliers) ** -2.0
+                )
             return E
         if first.is_bent or second.is_bent:  # F does not model distortion
-            return eight_point(inliers[:, :2], inliers[:, 9:11])
+            return epipolar.eight_point(inliers[:, :2], inliers[:, 9:11])
         return second.K.T @ fit.F @ first.K
 
-    def pose(self, R: FloatArray, t: FloatArray, inliers: NDArray[np.bool_], *, guided: bool = False) -> RelativePose:
+    def pose(self, R: FloatArray, t: FloatArray, inliers: BoolArray, *, guided: bool = False) -> RelativePose:
         """Return a pose with the statistics of its inliers, a mask (M,)."""
         used = self.lines[inliers]
         front = is_in_front(used, R, t)
@@ -233,19 +218,19 @@ class Pair:
             guided=guided,
         )  # fmt: skip
 
-    def inliers(self, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
+    def inliers(self, R: FloatArray, t: FloatArray) -> BoolArray:
         """Return a mask (M,) of the matches within the threshold of a pose with |t| = 1."""
         return pose_distances(self.lines, R, t) <= self.max_error_px
 
     def kind(self, used: FloatArray, R: FloatArray, t: FloatArray, angle_deg: float) -> str:
         """Return `RelativePose.kind` by the inliers `used` (N, 18) and their median triangulation angle."""
         within, clear = DEGENERACY.off * self.max_error_px, DEGENERACY.clear_share
-        if angle_deg < OPTIONS.rotation_deg and np.mean(rotation_residuals(used, R) <= within) >= clear:
+        if angle_deg < OPTIONS.rotation_deg and np.mean(epipolar.rotation_residuals(used, R) <= within) >= clear:
             return "rotation"
-        ahead, unit = points_ahead(used), pixels_per_radian(self.lines.reshape(-1, 9))
+        ahead, unit = points_ahead(used), epipolar.pixels_per_radian(self.lines.reshape(-1, 9))
         if len(ahead) < (1.0 - clear) * len(used):
             return "calibrated"
-        H = dominant_homography(np.asfortranarray(ahead), cross_matrix(t) @ R, self.max_error_px / unit)
+        H = dominant_homography(np.asfortranarray(ahead), epipolar.cross_matrix(t) @ R, self.max_error_px / unit)
         on_plane = np.count_nonzero(transfer_distance(H, ahead) <= within / unit)
         return "planar" if on_plane >= clear * len(used) else "calibrated"
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.types import PairId
@@ -64,8 +63,7 @@ def partners_of(pairs: Iterable[PairId]) -> dict[int, set[int]]:
 # weigh more than the least cut between the two ends (Ford and Fulkerson 1956).
 
 
-@dataclass(frozen=True, slots=True)
-class CorrectionOptions:
+class CORRECTIONS:
     """When a part of the photos is turned. Chosen by hand."""
 
     contradicts_deg: float = 10.0
@@ -76,9 +74,6 @@ class CorrectionOptions:
     """Flows are whole numbers of the largest weight over this."""
     max_turns: int = 20
     """Most parts of a graph that turn."""
-
-
-CORRECTIONS = CorrectionOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,8 +157,7 @@ def _make_network(
     return sparse.coo_array((values, (rows, columns)), shape=(count + 2, count + 2)).tocsr()
 
 
-@dataclass(frozen=True, slots=True)
-class AveragingOptions:
+class AVERAGING:
     """Rotation averaging; docs/algorithms/relative-poses.md."""
 
     agreement_deg: float = 5.0
@@ -182,9 +176,6 @@ class AveragingOptions:
     """Loops that are checked at once, to bound the memory. Chosen by hand."""
     dense_photos: int = 400
     """Most photos for which a dense system costs less than conjugate gradients. Counted."""
-
-
-AVERAGING = AveragingOptions()
 
 
 def average_rotations(
@@ -258,7 +249,7 @@ def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) ->
     return np.asarray((sums[0] + least) / (sums[1] + least), np.float64)
 
 
-def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArray[np.bool_]]:
+def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, BoolArray]:
     """Return (L, 3) edges of every loop of three photos, and whether it agrees; edges have the smaller photo first."""
     from scipy.spatial.transform import Rotation
 

@@ -5,7 +5,7 @@ are the panels of the lens.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, NamedTuple
@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import SubFigure
 
 
-@dataclass(frozen=True, slots=True)
-class FigureOptions:
+class OPTIONS:
     """Sampling and sizes of the figure."""
 
     residual_cells: int = 14
@@ -53,8 +52,6 @@ class FigureOptions:
     most_pairs: int = 300
     """Pairs of a camera in the figure, those of most weight: more lines hide each other and take a minute. By hand."""
 
-
-OPTIONS = FigureOptions()
 
 # Residuals of matches over the photo, through the calibrated lens and before bundle adjustment. Where they are larger
 # than elsewhere, the lens model errs.

@@ -37,11 +37,7 @@ class CorrelationTable:
 
 
 def correlation_table(before: Calibration, after: CameraModel | None) -> CorrelationTable | None:
-    """Return the correlations after the last adjustment, else those from pairs; None if neither is known.
-
-    Lens terms of value 0 are omitted, and the second focal of square pixels. An undetermined center stays in the table:
-    its error causes an error of the focal.
-    """
+    """Return the correlations after the last adjustment, else those from pairs; None if neither is known."""
     if after is not None and after.correlations:
         values = dict(zip(PARAMETERS.get(after.model, ()), after.params, strict=False))
         omitted = () if "aspect" in after.determined else ("fy",)
@@ -167,10 +163,7 @@ def plain_text(line: str) -> str:
 
 
 def unknown_cameras(contents: RunContents) -> list[str]:
-    """Return reason, used value and remedy for each undetermined camera.
-
-    A camera without placed photos does not affect the model, and is omitted.
-    """
+    """Return reason, used value and remedy for each undetermined camera."""
     cameras = contents.intrinsics.cameras if contents.intrinsics is not None else {}
     after = contents.scene.cameras if contents.scene is not None else {}
     return [

@@ -4,7 +4,6 @@ from html import escape
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.models import camera_matrix
 from sfm_app.formats.frusta import scene_size
@@ -16,6 +15,7 @@ from sfm_app.report.scene_view import view_points
 from sfm_app.synthetic.cameras import Camera
 from sfm_app.synthetic.render import PreparedModel, orbited_pose, render_model
 from sfm_app.types import Model, PosedPhoto
+from sfm_app.types.arrays import ByteArray, FloatArray
 
 WIDTH_PX, SUPERSAMPLING = 640, 2
 POINT_PX = 2
@@ -36,7 +36,7 @@ def run_html(contents: RunContents) -> str:
     return f"<div>{image}<table>{rows}</table></div>"
 
 
-def model_cutout(contents: RunContents) -> NDArray[np.uint8] | None:
+def model_cutout(contents: RunContents) -> ByteArray | None:
     """Return a transparent picture (H, W, 4) RGBA of the model, or of its points; None if no photo is placed."""
     points = view_points(contents)
     if points is None or not points.cameras:
@@ -75,7 +75,7 @@ def _scaled_camera(photo: PosedPhoto, width: int) -> Camera:
     return Camera(K, width, height)
 
 
-def _draw_points(model: Model, camera: Camera, pose: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _draw_points(model: Model, camera: Camera, pose: FloatArray) -> ByteArray:
     """Return the points as opaque squares, near ones over far ones, at the size of a picture."""
     size = camera.width // SUPERSAMPLING, camera.height // SUPERSAMPLING
     picture = np.zeros((size[1], size[0], 4), np.uint8)

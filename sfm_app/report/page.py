@@ -59,10 +59,7 @@ def three_script() -> str:
 
 
 def finish_report(run: RunContext, problem: SfmError | None = None) -> Path | None:
-    """Note how a run ended, and write its report; a failure here does not end the run.
-
-    The result is None if no run has begun in the folder, or another run is using it.
-    """
+    """Note how a run ended, and write its report; None if no run has begun, or another one is at work."""
     place = run.workspace
     if not (place.root / LOCK).exists():
         return None
@@ -120,9 +117,7 @@ def render_page(contents: RunContents, parts: LargeParts, other: RunContents | N
     model = _read_model(contents)
     rows = photo_rows(contents, model, parts.pictures)
     warnings, others = findings.remarks(contents)
-    photos = [
-        {key: value for key, value in asdict(row).items() if key != "picture" and value is not None} for row in rows
-    ]
+    photos = [{k: v for k, v in asdict(row).items() if k != "picture" and v is not None} for row in rows]
     page = _environment().get_template("page.html.jinja").render(
         title=contents.run.workspace.root.resolve().name,
         headline=headline(contents, rows),

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.colmap.dense import read_photo_and_depth
 from sfm_app.colmap.model import ModelFigures
 from sfm_app.report.contents import UNREADABLE, RunContents, data_address
 from sfm_app.report.figures import OPTIONS, draw_intrinsics
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import ByteArray, FloatArray
 from sfm_app.types.scene import camera_center
 
 # Figures: cameras, matched pairs of photos, and the scene from above.
@@ -199,7 +198,6 @@ def _png(draw: Callable[["Figure"], None], size: tuple[float, float]) -> str:
 
 # Some photos beside their depth maps, in colors from near to far.
 
-ByteArray = NDArray[np.uint8]
 
 MOST_SHOWN = 6
 """Number of depth pictures. By hand."""

@@ -303,10 +303,7 @@ class ViewHandler(BaseHTTPRequestHandler):
 
 
 def open_server(resources: RunResources, port: int = 0, host: str = "") -> ViewServer:
-    """Start to listen, and return the server; port 0 is any free one, ConfigError for one that cannot be used.
-
-    With a `host`, the server listens at this address, and requests need its token.
-    """
+    """Start to listen, and return the server; port 0 is any free one, ConfigError for one that cannot be used."""
     try:
         return ViewServer(resources, port, host)
     except (OSError, OverflowError, UnicodeError) as err:  # Unicode: a name with an empty part

@@ -141,9 +141,7 @@ def contradiction_lines(counts: Mapping[str, Any]) -> list[str]:
 def k_text(K: Any, spread: Mapping[str, float] = MappingProxyType({})) -> str:
     """Return focals and center of K (3, 3) in pixels, with those standard deviations that are known."""
     values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    parts = (
-        f"{name} {value:.1f}" + (f" +- {spread[name]:.1f}" if name in spread else "") for name, value in values.items()
-    )
+    parts = (f"{k} {v:.1f}" + (f" +- {spread[k]:.1f}" if k in spread else "") for k, v in values.items())
     return "  ".join(parts) + " px"
 
 
@@ -177,12 +175,21 @@ def distance_text(distance: Distance) -> str:
 def result_lines(intrinsics: Intrinsics | None, scene: Scene | None, stages: Mapping[str, Any]) -> list[str]:
     """Return cameras, scene and size as lines of text; `stages` are the records of the manifest."""
     counts = {name: stage["counts"] for name, stage in stages.items()}
-    lines = intrinsics_lines(intrinsics) if intrinsics is not None else []
+    lines = [f"            {WARNING}{text}" for text in input_warnings(counts.get("photos", {}))]
+    lines += intrinsics_lines(intrinsics) if intrinsics is not None else []
     for stage in ("view_graph", "intrinsics"):
         lines += [f"            {text}" for text in contradiction_lines(counts.get(stage, {}))]
     if scene is not None:
         lines += scene_lines(scene, counts.get("scene", {}))
     return [*lines, *scale_lines(counts["scale"])] if "scale" in counts else lines
+
+
+def input_warnings(counts: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what masks and positions are of no use, from the figures of the stage `photos`."""
+    masks = counts.get("masks", {})
+    useless = {"masks hide nothing": masks.get("white"), "masks belong to no photo": masks.get("unused")}
+    useless |= {f"{file} names photos that are not there": names for file, names in counts.get("missing", {}).items()}
+    yield from (f"{what}: {list_names(names, NAMES_SHOWN)}" for what, names in useless.items() if names)
 
 
 # Summaries of a run's scene: lines of text, and plain values for --json.
@@ -283,10 +290,7 @@ def _shutter_lines(shutter: Mapping[str, Any]) -> Iterator[str]:
 
 def _adjustment_warnings(adjustment: Mapping[str, Any]) -> Iterator[str]:
     if adjustment.get("failed"):
-        yield (
-            f"beware: the last adjustment failed ({adjustment['failed']}); cameras and poses are those of mapping, "
-            "with unknown errors"
-        )
+        yield f"beware: the last adjustment failed ({adjustment['failed']}); cameras and poses are those of mapping"
     for number, reason in adjustment.get("failed_in_other_models", {}).items():
         yield f"beware: the last adjustment of other_models/{number} failed ({reason})"
     for name in adjustment.get("cameras_held", ()):
@@ -302,15 +306,10 @@ def _doubt_lines(counts: Mapping[str, Any]) -> Iterator[str]:
         )
     for join in counts.get("perhaps_look_alikes", ()):
         here, there = (list_names(names, NAMES_SHOWN) for names in join["between"])
-        yield (
-            f"beware: a loop, or look-alikes: {join['pairs']} pairs match {here} with {there}, "
-            "but no photos between them confirm it"
-        )
+        yield f"beware: a loop, or look-alikes: {join['pairs']} pairs match {here} with {there}, without photos between"
     for names in counts.get("weakly_joined", ()):
-        yield (
-            f"beware: few points determine the distance of {list_names(names, NAMES_SHOWN)} from the rest; "
-            "take more photos between them"
-        )
+        text = list_names(names, NAMES_SHOWN)
+        yield f"beware: few points determine the distance of {text} from the rest; take more photos between them"
     for before, after in counts.get("jumps", ()):
         yield f"beware: a jump between the consecutive photos {before} and {after}; in a video, a sign of look-alikes"
 

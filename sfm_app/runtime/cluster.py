@@ -37,8 +37,7 @@ logger = logging.getLogger("sfm_app")
 Result = TypeVar("Result")
 
 
-@dataclass(frozen=True, slots=True)
-class TransferOptions:
+class OPTIONS:
     """Sizes and times of the work on a cluster."""
 
     look_s: float = 2.0
@@ -54,8 +53,6 @@ class TransferOptions:
     most_items: int = 32
     """Most items of a call: the cost of a lost worker. Chosen by hand."""
 
-
-OPTIONS = TransferOptions()
 
 # Serialization. Pickles are read here only, since they may run any code. Their bytes, or the hashes of their files,
 # come through the network of the cluster, which has to be trusted as a whole. A file with another hash is refused.
@@ -396,9 +393,7 @@ def connect(settings: ClusterSettings, folder: Path) -> Iterator[Cluster]:
     try:
         import distributed
     except ImportError:
-        raise ConfigError(
-            "a cluster needs Dask, which is not installed", hint="pip install 'sfm-app[cluster]'"
-        ) from None
+        raise ConfigError("a cluster needs Dask", hint="pip install 'sfm-app[cluster]'") from None
     known = [name for name in logging.root.manager.loggerDict if name.startswith("distributed.")]
     for name in ("distributed", "tornado", "asyncio", *known):  # this program reports errors in one line
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
@@ -418,9 +413,7 @@ def connect(settings: ClusterSettings, folder: Path) -> Iterator[Cluster]:
         try:
             client.wait_for_workers(max(1, count), timeout=settings.wait_s)
         except TimeoutError as err:
-            raise ClusterError(
-                f"the scheduler {settings.address} has no workers", hint="start some: see docs/cluster.md"
-            ) from err
+            raise ClusterError(f"the scheduler {settings.address} has no workers", hint="see docs/cluster.md") from err
         yield Cluster(client, folder, settings, limit=count)
 
 

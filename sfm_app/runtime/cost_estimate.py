@@ -23,8 +23,7 @@ SERIAL_STAGES = ("scene", "mesh")
 """Stages that more workers hardly speed up."""
 
 
-@dataclass(frozen=True, slots=True)
-class CostOptions:
+class OPTIONS:
     """Measured rates, each per megapixel (MP) of photos or depth maps."""
 
     features_per_mp: int = 4500
@@ -43,9 +42,6 @@ class CostOptions:
     """Memory of the refinement without photos. Measured."""
     refine_mb_per_mp: float = 25.0
     """Memory of the refinement per megapixel held at once, with divided triangles. Measured."""
-
-
-OPTIONS = CostOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,18 +83,12 @@ def largest_photo_megapixels(limit_mb: float) -> float:
 
 
 def cache_gb(limit_mb: float) -> float:
-    """Return the size of fusion's cache of depth maps in GB; points and surface need memory, too.
-
-    With a cache smaller than the maps, fusion reads all of them again and again.
-    """
+    """Return the size of fusion's cache of depth maps in GB; points and surface need memory, too."""
     return min(64.0, max(0.25, (limit_mb - 1500) / 1000))
 
 
 def block_count(points: float, options: MeshSettings) -> int:
-    """Return the number of blocks of the surface: one, or blocks of half the permitted number of points.
-
-    Two workers then need no more memory than the largest surface in one piece.
-    """
+    """Return the number of blocks of the surface: one, or blocks of half the permitted number of points."""
     return 1 if points <= options.block_points else math.ceil(2 * points / options.block_points)
 
 

@@ -89,9 +89,7 @@ class Manifest:
             default = self.root.resolve()
             default = default.with_name(f"{default.name}-model")  # where a run without -o writes
             guess = f"\nis it {default}?" if (default / MANIFEST).exists() else ""
-            raise InputError(
-                f"{self.root} holds no run", hint=f"name the folder that `sfm-app run PHOTOS -o OUT` wrote{guess}"
-            )
+            raise InputError(f"{self.root} holds no run", hint=f"name a folder that `sfm-app run` wrote{guess}")
         self.check_format()
 
     def record(self, stage: str) -> StageRecord | None:
@@ -155,7 +153,7 @@ DATABASE, CALIBRATION, SCENE, SCALE = "database.db", "calibration.json", "scene.
 INPUTS = ".inputs"
 OUTPUT_NAMES = (*RUN_FOLDERS, DATABASE, CALIBRATION, SCENE, SCALE, INPUTS)
 """Files and folders that a run replaces."""
-HOLDER = ".held-by.txt"
+HOLDER, ELSEWHERE = ".held-by.txt", "name another output folder with -o"
 PARTS, FEATURES, MAPPING = "view_graph_parts", "feature_parts", ".mapping"
 EARLIER, CLUSTER_FILES, SIFT_ROWS = ".earlier", ".cluster", ".sift_rows"
 LINK_CHECKED = (*OUTPUT_NAMES, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING, EARLIER, CLUSTER_FILES, SIFT_ROWS)
@@ -224,14 +222,12 @@ class Workspace:
         known = any((self.root / name).exists() for name in (LOCK, MANIFEST))
         foreign = [] if known else [name for name in OUTPUT_NAMES if (self.root / name).exists()]
         if foreign:
-            raise InputError(
-                f"{self.root / foreign[0]} exists, and no run has made it", hint="name another output folder with -o"
-            )
+            raise InputError(f"{self.root / foreign[0]} exists, and no run has made it", hint=ELSEWHERE)
         link = next(self._links(), None)
         if link:
-            raise InputError(f"{link} is a link, and no run has made it", hint="name another output folder with -o")
+            raise InputError(f"{link} is a link, and no run has made it", hint=ELSEWHERE)
         if self.root.is_file():
-            raise InputError(f"cannot write to {self.root}: it is a file", hint="name an output folder with -o")
+            raise InputError(f"cannot write to {self.root}: it is a file", hint=ELSEWHERE)
         try:
             self.root.mkdir(parents=True, exist_ok=True)
         except OSError as err:
@@ -259,21 +255,13 @@ class Workspace:
         """Check that a run would not overwrite its photos or masks (`what`); InputError if it would."""
         folder, out = photos.resolve(), self.root.resolve()
         if folder == out:
-            raise InputError(
-                f"{photos} cannot be both the {what} and the output", hint="name another output folder with -o"
-            )
+            raise InputError(f"{photos} cannot be both the {what} and the output", hint=ELSEWHERE)
         if any(folder.is_relative_to(out / name) for name in OUTPUT_NAMES):
-            raise InputError(
-                f"{photos} lies where the run in {self.root} keeps its own files",
-                hint="name another output folder with -o",
-            )
+            raise InputError(f"{photos} lies where the run in {self.root} keeps its own files", hint=ELSEWHERE)
 
     @contextlib.contextmanager
     def hold_lock(self) -> Iterator[None]:
-        """Hold the lock that keeps other runs out (InputError) until the block, or this process, ends.
-
-        A block inside another one of the same object changes nothing.
-        """
+        """Hold the lock that keeps other runs out (InputError) until the outermost block, or this process, ends."""
         if self._is_held:
             yield
             return
@@ -284,13 +272,11 @@ class Workspace:
         except Timeout:
             raise InputError(
                 f"another run is at work in {self.root}: {_read_holder(holder)}",
-                hint="wait for it, end it, or name another output folder with -o",
+                hint=f"wait for it, end it, or {ELSEWHERE}",
             ) from None
         try:
             started = datetime.now().astimezone().isoformat(" ", "seconds")
-            holder.write_text(
-                f"process {os.getpid()} on {platform.node()} since {started}\n", encoding="utf-8", newline="\n"
-            )
+            holder.write_text(f"process {os.getpid()} on {platform.node()} since {started}", encoding="utf-8")
             self._is_held = True
             yield
         finally:
@@ -309,10 +295,7 @@ class Workspace:
                 file.touch()
 
     def check_exists(self) -> None:
-        """Check that the folder still exists during a run, and is writable.
-
-        A removed folder with new files of this run is marked as made by a run: otherwise the next run would refuse it.
-        """
+        """Check that the folder still exists during a run, and is writable; if it was made again, it stays a run's."""
         if not (self.root / LOCK).exists():
             names = {path.name for path in self.root.iterdir()} if self.root.is_dir() else set()
             if names and names <= {*LINK_CHECKED, PHOTO_SET, VIEW_GRAPH}:
@@ -336,10 +319,7 @@ class SubWorkspace(Workspace):
 
 
 def _cannot_write(folder: Path, err: OSError) -> InputError:
-    return InputError(
-        f"cannot write to {folder}: {err.strerror}",
-        hint="make it writable and run the same command again, or name another output folder with -o",
-    )
+    return InputError(f"cannot write to {folder}: {err.strerror}", hint=f"make it writable, or {ELSEWHERE}")
 
 
 def _read_holder(file: Path) -> str:

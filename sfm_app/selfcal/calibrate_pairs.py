@@ -44,8 +44,7 @@ from sfm_app.types.arrays import BoolArray, FloatArray
 from sfm_app.types.camera import named_correlations
 
 
-@dataclass(frozen=True, slots=True)
-class FitOptions:
+class FITTING:
     """Rounds of the fit, and its uncertainty. Sections are those of docs/algorithms/zero-curves.md."""
 
     few_matches: int = 100
@@ -71,9 +70,6 @@ class FitOptions:
     """Median rotation of pairs below which the axes count as parallel; by hand."""
     isosceles: float = 0.1
     """Largest median deviation, in cosines, of pairs whose axes meet at one distance from both cameras; by hand."""
-
-
-FITTING = FitOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -58,8 +58,7 @@ ANY_PIXELS = (*SQUARE_PIXELS, LOG_ASPECT)
 """Places in theta that are free for any pixels."""
 
 
-@dataclass(frozen=True, slots=True)
-class ConsensusOptions:
+class CONSENSUS:
     """Search and verdict. Sections are those of docs/algorithms/zero-curves.md."""
 
     first_steps: tuple[float, ...] = (0.05, 0.03, 0.03, 0.05)
@@ -112,9 +111,6 @@ class ConsensusOptions:
     Chosen on the same 109 cameras, section 5."""
     safe_support: float = 0.8
     """Share of all votes that K then needs: a cause of missing votes may bias the others. Chosen with it."""
-
-
-CONSENSUS = ConsensusOptions()
 
 
 class Consensus:

@@ -13,16 +13,8 @@ import numpy as np
 
 from sfm_app.camera.models import guessed_camera_matrix
 from sfm_app.jit import kernel
+from sfm_app.selfcal import calibrate_pairs
 from sfm_app.selfcal.adjustment import CAMERA, Matches
-from sfm_app.selfcal.calibrate_pairs import (
-    Fit,
-    camera_uncertainty,
-    covariance,
-    critical_motion,
-    fit_cameras,
-    key_pairs,
-    undistorted_fundamentals,
-)
 from sfm_app.selfcal.consensus import CONSENSUS, rejection_reason, uncertainty_reason
 from sfm_app.selfcal.pairs import (
     CENTER_U,
@@ -45,8 +37,7 @@ LEAST_PAIRS_OF_SEVERAL = 2
 definition of the constraint (thesis 5.2.4)."""
 
 
-@dataclass(frozen=True, slots=True)
-class GroupOptions:
+class GROUPS:
     """Focals on a grid, and the verdict on a camera of several. Section 6 of docs/algorithms/zero-curves.md."""
 
     focals: int = 41
@@ -60,9 +51,6 @@ class GroupOptions:
     `benchmarks.trouble`, seeds 0 to 179 and 1000 to 1020."""
     least_support: float = 0.8
     """Share that all of its photos together must give; two cameras get 0.86 to 0.93. Chosen with it."""
-
-
-GROUPS = GroupOptions()
 
 
 def log_focal_grid(count: int) -> FloatArray:
@@ -225,12 +213,12 @@ def calibrate_cameras(
     unknown = np.array([camera.start is None for camera in cameras])
     if unknown.any():
         thetas = _find_focals(thetas, unknown, VoteTables(Fs, members, weights), priors)
-    fit = fit_cameras(matches, Fs, [thetas], priors)
-    tables = VoteTables(undistorted_fundamentals(fit), members, weights)
-    cov = covariance(fit, sides)
+    fit = calibrate_pairs.fit_cameras(matches, Fs, [thetas], priors)
+    tables = VoteTables(calibrate_pairs.undistorted_fundamentals(fit), members, weights)
+    cov = calibrate_pairs.covariance(fit, sides)
     calibrations = [_judge_camera(k, camera, fit, cov, tables, method) for k, camera in enumerate(cameras)]
     camera_of = dict(zip(photos, members.tolist(), strict=True))
-    order = key_pairs(fit, tuple(photos))
+    order = calibrate_pairs.key_pairs(fit, tuple(photos))
     return [
         replace(calibration, key_pairs=tuple(pair for pair in order if camera_of[pair] == [k, k]))
         for k, calibration in enumerate(calibrations)
@@ -238,7 +226,7 @@ def calibrate_cameras(
 
 
 def _judge_camera(
-    index: int, camera: CameraGroup, fit: Fit, covariances: FloatArray, tables: VoteTables, method: str
+    index: int, camera: CameraGroup, fit: calibrate_pairs.Fit, covariances: FloatArray, tables: VoteTables, method: str
 ) -> Calibration:
     """Return the verdict on one camera of a joint fit with these covariances (5C, 5C)."""
     theta, unit = fit.state.thetas[index], fit.matches.unit_px
@@ -263,7 +251,7 @@ def _judge_camera(
         reason = "the pairs fit other focals as well or better"
     # a motion that leaves the focal open is the reason only where the deviation is small
     elif (camera.family >= 0 or camera.divided) and not (camera.divided and uncertain):
-        reason = critical_motion(fit)
+        reason = calibrate_pairs.critical_motion(fit)
     side = max(camera.size) / unit
     in_sides = np.array([theta[LOG_FOCAL] - np.log(side), theta[CENTER_U] / side, theta[CENTER_V] / side])
     reason = reason or rejection_reason(in_sides, spread, camera.size)
@@ -278,7 +266,7 @@ def _judge_camera(
     calibration = downgrade_to_estimate(
         replace(
             calibration_from_parameters(theta, camera.size, method, unit),
-            **camera_uncertainty(theta, cov, unit),
+            **calibrate_pairs.camera_uncertainty(theta, cov, unit),
             evidence=evidence,
             held=fit.held_names(index),
         ),

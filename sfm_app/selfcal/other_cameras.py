@@ -7,7 +7,6 @@ of the pairs and predict the rest.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import chain
 from math import lgamma
 from typing import NamedTuple
@@ -22,8 +21,7 @@ from sfm_app.types import PairId
 from sfm_app.types.arrays import FloatArray, IndexArray
 
 
-@dataclass(frozen=True, slots=True)
-class DivisionOptions:
+class DIVISION:
     """Comparison of hypotheses. Section 6 of docs/algorithms/zero-curves.md."""
 
     focals: int = 81
@@ -36,9 +34,6 @@ class DivisionOptions:
     """Parts of the pairs that are held out in turn; by hand."""
     max_remaining_share: float = 0.5
     """Share of the unexplained likelihood that more cameras may leave: right ones leave 0.15 to 0.37. Section 6."""
-
-
-DIVISION = DivisionOptions()
 
 
 class Division(NamedTuple):
@@ -114,10 +109,7 @@ def _choose(
 
 
 def log_probability(labels: IndexArray) -> float:
-    """Return the log-probability of cameras of photos (N,) before any pair (Ewens 1972, with the parameter 1).
-
-    All numbers of photos of the first photo's camera are equally likely.
-    """
+    """Return the log-probability of cameras of photos (N,) before any pair (Ewens 1972, with the parameter 1)."""
     counts = np.bincount(labels)
     return sum(map(lgamma, counts[counts > 0].tolist())) - lgamma(len(labels) + 1)
 

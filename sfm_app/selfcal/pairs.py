@@ -82,12 +82,7 @@ def prepare(pairs: CameraPairs, *, unit_px: float, origin_px: tuple[float, float
 
 
 def check_pairs(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, IndexArray]:
-    """Return matrices (Q, 3, 3), weights (Q,) and rows of the pairs with a weight.
-
-    Raises:
-        ValueError: a shape is wrong, a number is not finite, a weight is negative, an F is zero, or the size is not
-            positive.
-    """
+    """Return matrices (Q, 3, 3), weights (Q,) and rows of the pairs with a weight; ValueError if malformed."""
     raw = np.asarray(pairs.Fs, dtype=np.float64)
     trust = np.asarray(pairs.weights, dtype=np.float64)
     if raw.size == 0:

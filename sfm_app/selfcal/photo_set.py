@@ -85,9 +85,7 @@ def _calibrate_alone(
         return calibrate(own, options, seed)
     except FAILURES as err:
         logger.info("calibration of a camera failed", exc_info=err)
-        return guess_calibration(
-            own.size, f"the computation failed: {error_reason(err)}", {"pairs": float(len(own.Fs))}
-        )
+        return guess_calibration(own.size, f"it failed: {error_reason(err)}", {"pairs": float(len(own.Fs))})
 
 
 def _split_and_calibrate(

@@ -12,21 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.models import ASPECT, CENTER, FOCAL, FREE_SHARE, LENS, NARROW, WIDE
-from sfm_app.geometry.least_squares import (
-    NormalPriors,
-    Posteriors,
-    binary_choices,
-    cavity,
-    inverses_of_positive,
-    posteriors,
-)
+from sfm_app.geometry import least_squares
 from sfm_app.selfcal.adjustment import CAMERA, Prior
 from sfm_app.selfcal.pairs import CENTER_U, KAPPA, LOG_ASPECT, LOG_FOCAL
 from sfm_app.types import CameraPrior
-from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 NAMES = ("center", "aspect", "k1", "focal")
 """Names of the parts in `Calibration.held`."""
@@ -35,8 +27,7 @@ COLUMNS = {CENTER: [CENTER_U, CENTER_U + 1], ASPECT: [LOG_ASPECT], LENS: [KAPPA]
 PART_OF_COLUMN = [FOCAL, CENTER, CENTER, ASPECT, LENS]
 
 
-@dataclass(frozen=True, slots=True)
-class PriorOptions:
+class PRIORS:
     """Usual cameras, and how far photos depart from them."""
 
     usual_log_focal: float = float(np.log(1.2))
@@ -54,9 +45,6 @@ class PriorOptions:
     least_redundancy: float = 0.25
     """Least share of redundant constraints for freeing more: three pairs fit almost any center.
     docs/algorithms/zero-curves.md, 3; by hand."""
-
-
-PRIORS = PriorOptions()
 
 
 def claim_rows(priors: Sequence[CameraPrior | None], sizes: Sequence[tuple[int, int]], unit_px: float) -> FloatArray:
@@ -143,7 +131,7 @@ class Evidence:
         prior = self.priors.prior(free, self.thetas)
         precision, offset = prior.precision.ravel(), (prior.mean - self.thetas).ravel()
         share = redundancy(free, self.pairs)
-        covariance = inverses_of_positive(share * self.H + np.diag(precision))
+        covariance = least_squares.inverses_of_positive(share * self.H + np.diag(precision))
         pull = share * self.g + precision * offset
         step = covariance @ pull
         fit = 0.5 * float(pull @ step) - 0.5 * float(precision @ offset**2)
@@ -152,7 +140,7 @@ class Evidence:
 
     def choices(self, free: BoolArray, camera: int) -> BoolArray:
         """Return (K, C, 4) choices for one camera, less free first, without those of too little redundancy."""
-        switches = binary_choices(free.shape[1])
+        switches = least_squares.binary_choices(free.shape[1])
         trials = np.repeat(free[None], len(switches), axis=0)
         trials[:, camera] = switches
         allowed = [k == 0 or redundancy(trial, self.pairs) >= PRIORS.least_redundancy for k, trial in enumerate(trials)]
@@ -192,17 +180,17 @@ class Evidence:
 
     def camera_posteriors(
         self, free: BoolArray, camera: int, step: FloatArray, covariance: FloatArray
-    ) -> tuple[BoolArray, Posteriors]:
+    ) -> tuple[BoolArray, least_squares.Posteriors]:
         """Return all choices (K, C, 4) for one camera, and its posteriors; `step` and `covariance` are of `free`."""
         block = slice(CAMERA * camera, CAMERA * (camera + 1))
         prior, trials = self.priors.prior(free, self.thetas), self.choices(free, camera)
         offset = prior.mean - self.thetas
-        H, g = cavity(covariance[block, block], step[block], prior.precision[camera], offset[camera])
+        H, g = least_squares.cavity(covariance[block, block], step[block], prior.precision[camera], offset[camera])
         others = [self.priors.prior(trial, self.thetas) for trial in trials]
         scale = np.array([redundancy(trial, self.pairs) for trial in trials]) / redundancy(free, self.pairs)
-        posterior = posteriors(
+        posterior = least_squares.posteriors(
             scale[:, None, None] * H, scale[:, None] * g,
-            NormalPriors(
+            least_squares.NormalPriors(
                 np.array([other.precision[camera] for other in others]),
                 np.array([(other.mean - self.thetas)[camera] for other in others]),
                 np.array([self.priors.log_odds(trial) for trial in trials]),
@@ -221,7 +209,7 @@ def redundancy(free: BoolArray, pairs: float) -> float:
 class TiedPriors(CameraPriors):
     """Hierarchical priors: the focals of a family scatter about their own mean, which is set to its optimum."""
 
-    families: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    families: IndexArray = field(default_factory=lambda: np.empty(0, np.int64))
     """(C,) number of each camera's family; -1 for none."""
 
     def prior(self, free: BoolArray, thetas: FloatArray, held: BoolArray | None = None) -> Prior:

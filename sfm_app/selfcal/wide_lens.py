@@ -12,19 +12,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera import rows as families
 from sfm_app.camera.projection import RAY, Fisheye, image_rays
-from sfm_app.geometry.epipolar import (
-    FIRST,
-    SECOND,
-    cross_matrix,
-    decompose_essential,
-    fit_rays,
-    signed_distances,
-    squared_distances,
-)
+from sfm_app.geometry import epipolar
 from sfm_app.geometry.least_squares import damped_step, inverse_of_positive, solve_each
 from sfm_app.geometry.poses import POSE_DOF, retract, write_nearby_essentials
 from sfm_app.numerical import MAD_TO_SIGMA
@@ -42,8 +33,7 @@ RAY_STEP = 1e-5
 """The same in points, in longer sides: errors of about 1e-10 of the derivatives in double precision."""
 
 
-@dataclass(frozen=True, slots=True)
-class LensSearchOptions:
+class SEARCH:
     """The grid of lenses, the pairs that vote, and the verdict."""
 
     exponents: tuple[float, ...] = (0.5, 0.0, -0.5)
@@ -112,7 +102,6 @@ class LensRefinementOptions:
     hand."""
 
 
-SEARCH = LensSearchOptions()
 REFINEMENT = LensRefinementOptions()
 
 
@@ -160,16 +149,16 @@ def _rays_and_slopes(lens: Lens | Equirectangular, points: FloatArray) -> FloatA
 
 def search_rays(lines: FloatArray, samples: IndexArray, threshold: float) -> tuple[float, FloatArray]:
     """Return the support of the best F by samples (S, 8), as in MSAC, and F, for bearing vectors (N, 18)."""
-    p, q = lines[:, FIRST], lines[:, SECOND]
-    Fs = fit_rays(p[samples], q[samples])
+    p, q = lines[:, epipolar.FIRST], lines[:, epipolar.SECOND]
+    Fs = epipolar.fit_rays(p[samples], q[samples])
     supports = _supports(Fs, lines, threshold)
     best = int(np.argmax(supports))
     F, support = Fs[best], float(supports[best])
     for _ in range(SEARCH.refits):
-        inliers = squared_distances(F[None], lines)[0] < threshold**2
+        inliers = epipolar.squared_distances(F[None], lines)[0] < threshold**2
         if np.count_nonzero(inliers) < SEARCH.least_inliers:
             break
-        refit = fit_rays(p[inliers], q[inliers])
+        refit = epipolar.fit_rays(p[inliers], q[inliers])
         value = float(_supports(refit[None], lines, threshold)[0])
         if value <= support:
             break
@@ -178,7 +167,9 @@ def search_rays(lines: FloatArray, samples: IndexArray, threshold: float) -> tup
 
 
 def _supports(Fs: FloatArray, lines: FloatArray, threshold: float) -> FloatArray:
-    return np.asarray(np.sum(1.0 - np.minimum(squared_distances(Fs, lines) / threshold**2, 1.0), axis=1), np.float64)
+    return np.asarray(
+        np.sum(1.0 - np.minimum(epipolar.squared_distances(Fs, lines) / threshold**2, 1.0), axis=1), np.float64
+    )
 
 
 Family = type[Fisheye] | type[RadialLens]
@@ -226,7 +217,7 @@ def refine_lens(start: Lens, pairs: Sequence[Pair], sigma: float) -> RefinedLens
     """
     matches = [x for x, _ in pairs]
     # any of the four poses of an essential matrix gives the same distances
-    poses = tuple(np.concatenate([R.ravel(), t]) for R, t in (decompose_essential(F)[0] for _, F in pairs))
+    poses = tuple(np.concatenate([R.ravel(), t]) for R, t in (epipolar.decompose_essential(F)[0] for _, F in pairs))
     shape = start.exponent if isinstance(start, Fisheye) else start.radial
     state = State(np.array([np.log(start.focal), shape, *start.center]), poses, type(start))
     for _ in range(REFINEMENT.noise_rounds):
@@ -297,9 +288,9 @@ def _pair_system(x: FloatArray, lenses: list[Lens], pose: FloatArray, sigma: flo
     write_nearby_essentials(pose, STEP, Es)
     (lens, *steps), (E, *turned) = lenses, Es
     pair = bearings_through(lens, x)
-    r = signed_distances(E, pair)
-    by_lens = [signed_distances(E, bearings_through(other, x)) - r for other in steps]
-    by_pose = [signed_distances(other, pair) - r for other in turned]
+    r = epipolar.signed_distances(E, pair)
+    by_lens = [epipolar.signed_distances(E, bearings_through(other, x)) - r for other in steps]
+    by_pose = [epipolar.signed_distances(other, pair) - r for other in turned]
     J, r = np.column_stack(by_lens + by_pose) / (STEP * sigma), r / sigma
     weights = (1.0 + (r / ROBUST_SCALE) ** 2) ** -2
     return (J * weights[:, None]).T @ J, -J.T @ (weights * r)
@@ -319,8 +310,8 @@ def pair_costs(matches: Sequence[FloatArray], state: State, sigma: float) -> Flo
 
 def _distances(matches: Sequence[FloatArray], state: State) -> list[FloatArray]:
     lens = state.lens
-    Es = [cross_matrix(pose[9:]) @ pose[:9].reshape(3, 3) for pose in state.poses]
-    return [signed_distances(E, bearings_through(lens, x)) for E, x in zip(Es, matches, strict=True)]
+    Es = [epipolar.cross_matrix(pose[9:]) @ pose[:9].reshape(3, 3) for pose in state.poses]
+    return [epipolar.signed_distances(E, bearings_through(lens, x)) for E, x in zip(Es, matches, strict=True)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -392,7 +383,7 @@ class _SampledPairs:
     """Matches (N, 4) of some pairs in longer sides from the middle, and samples (S, 8) of each."""
 
     matches: tuple[FloatArray, ...]
-    samples: tuple[NDArray[np.int64], ...]
+    samples: tuple[IndexArray, ...]
     threshold: float
 
     def search(self, lens: Lens | Equirectangular) -> list[tuple[float, FloatArray]]:

@@ -10,17 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_app.camera.models import CENTER, FOCAL, LENS
+from sfm_app.selfcal import calibrate_pairs
 from sfm_app.selfcal.adjustment import Matches
-from sfm_app.selfcal.calibrate_pairs import (
-    Fit,
-    camera_uncertainty,
-    covariance,
-    critical_motion,
-    extend_to_all_pairs,
-    fit_cameras,
-    key_pairs,
-    undistorted_fundamentals,
-)
 from sfm_app.selfcal.consensus import (
     CONSENSUS,
     Consensus,
@@ -76,13 +67,7 @@ ZERO_CURVES = ZeroCurveOptions()
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Find the K that most pairs agree on, and the lens; an estimate or a guess where the pairs do not determine K.
-
-    Without inliers no lens is found, and the standard deviations come from resampling the pairs.
-
-    Raises:
-        ValueError: malformed input, see `selfcal.pairs.prepare`.
-    """
+    """Find the K that most pairs agree on, and the lens; a guess where the pairs do not determine K."""
     usable = _prepare(pairs)
     evidence = {"pairs": float(len(usable))}
     if len(usable) < LEAST_PAIRS:
@@ -129,7 +114,7 @@ def _calibrate_from_matches(
     if adjusted.is_contradicted:
         adjusted = max(adjusted, _adjust(pairs, usable, priors, adjusted), key=lambda one: one.vote_share)
     fit, peak, weights = adjusted.fit, adjusted.peak, adjusted.consensus.pairs.weights
-    theta, cov = fit.state.thetas[0], covariance(fit, np.ones(1), resampled=True)
+    theta, cov = fit.state.thetas[0], calibrate_pairs.covariance(fit, np.ones(1), resampled=True)
     evidence |= peak.evidence(weights) | {
         "log_focal_spread": float(np.sqrt(cov[LOG_FOCAL, LOG_FOCAL])),
         "noise_px": fit.state.sigma * side,
@@ -139,7 +124,7 @@ def _calibrate_from_matches(
     }
     undetermined, disagreement = peak.undetermined_reason(weights), _disagreement_reason(adjusted)
     answer, spread = (peak.theta, 0.0) if disagreement else (theta, evidence["log_focal_spread"])
-    reason = undetermined and (critical_motion(fit) or undetermined)
+    reason = undetermined and (calibrate_pairs.critical_motion(fit) or undetermined)
     reason = reason or rejection_reason(answer, spread, pairs.size)
     if reason:
         return guess_calibration(pairs.size, reason, evidence)
@@ -149,10 +134,10 @@ def _calibrate_from_matches(
     photos = tuple(pairs.photos[k] for k in usable.indices[adjusted.rows]) if pairs.photos else ()
     calibration = replace(
         calibration_from_parameters(theta, pairs.size, METHOD),
-        **camera_uncertainty(theta, cov, side),
+        **calibrate_pairs.camera_uncertainty(theta, cov, side),
         evidence=evidence,
         held=fit.held_names(0),
-        key_pairs=key_pairs(fit, photos),
+        key_pairs=calibrate_pairs.key_pairs(fit, photos),
     )
     doubt = uncertainty_reason(spread) or peak.rival_reason(weights)
     doubt = doubt or (peak.aspect_reason if "aspect" in calibration.held else "")
@@ -171,7 +156,7 @@ def _unrejected(prior: CameraPrior | None, free: BoolArray) -> CameraPrior | Non
 class _Adjustment:
     """A camera adjusted to matches, and the consensus of all pairs to check it."""
 
-    fit: Fit
+    fit: calibrate_pairs.Fit
     rows: IndexArray
     """The usable pairs that it was adjusted to."""
     consensus: Consensus
@@ -206,17 +191,21 @@ def _adjust(pairs: CameraPairs, usable: Pairs, priors: CameraPriors, before: _Ad
     else:
         first, rows = before.peak, before.agreeing_pairs[_subsample(len(before.agreeing_pairs))]
         starts = [np.append(first.theta, before.fit.state.thetas[0, KAPPA])[None]]
-    fit = fit_cameras(matches.select(rows), Fs[rows], starts, priors)
+    fit = calibrate_pairs.fit_cameras(matches.select(rows), Fs[rows], starts, priors)
     consensus, peak = Consensus(usable, priors.center_sigma), first
     if fit.free[0, LENS]:
         to_sides = sides_from_pixels(pairs.size)
-        straight = to_sides.T @ undistorted_fundamentals(extend_to_all_pairs(fit, matches, Fs)) @ to_sides
+        straight = (
+            to_sides.T
+            @ calibrate_pairs.undistorted_fundamentals(calibrate_pairs.extend_to_all_pairs(fit, matches, Fs))
+            @ to_sides
+        )
         consensus = Consensus(_prepare(CameraPairs(straight, usable.weights, pairs.size)), priors.center_sigma)
     if fit.free[0, LENS] or (before is not None and before.fit.free[0, LENS]):
         peak = find_peak(consensus)
     if abs(peak.theta[LOG_FOCAL] - fit.state.thetas[0, LOG_FOCAL]) > np.log(CONSENSUS.rival_ratio):
         restart = np.append(peak.theta, fit.state.thetas[0, KAPPA])
-        fit = fit_cameras(matches.select(rows), Fs[rows], [fit.state.thetas, restart[None]], priors)
+        fit = calibrate_pairs.fit_cameras(matches.select(rows), Fs[rows], [fit.state.thetas, restart[None]], priors)
     return _Adjustment(fit, rows, consensus, peak)
 
 

@@ -8,23 +8,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from sfm_app.colmap.dense import (
-    DenseStore,
-    cameras_of_photos,
-    drop_estimates,
-    has_masks,
-    map_file,
-    mask_depths,
-    read_depth,
-    read_gray,
-    read_views,
-    undistort,
-    undistort_mask,
-    write_depth,
-    write_fusion_views,
-)
+from sfm_app.colmap import dense
 from sfm_app.colmap.wide_views import WideLens, split_wide_photos, write_model, write_views
 from sfm_app.errors import ReconstructionError
 from sfm_app.files import fingerprint, load_arrays, mark_finished, mark_unfinished, replace_atomically, resume_or_clear
@@ -34,7 +19,7 @@ from sfm_app.stereo import DepthTask, View, rank_neighbors
 from sfm_app.stereo.sky import PhotoAreas, blank_areas, count_votes, find_skies, sky_pixels
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Rejected, Scene
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
 
@@ -48,17 +33,17 @@ def make(scene: Scene, run: RunContext) -> Path:
     method, reason = run.plugins.depth_method(options.method)
     run.record(method=method.name, method_reason=reason)
     prepare(scene, dense_dir, method.name, run)
-    views = read_views(dense_dir)
+    views = dense.read_views(dense_dir)
     ranked = rank_neighbors(views, 2 * options.neighbors)  # twice as many confirm a map as make it
     with single_threaded_opencv():
-        rejections = method.make(DepthTask(dense_dir, views, ranked, options, DenseStore(dense_dir), run.map))
+        rejections = method.make(DepthTask(dense_dir, views, ranked, options, dense.DenseStore(dense_dir), run.map))
     if options.drop_sky:
-        drop_skies(dense_dir, [view for view in views if map_file(dense_dir, view).exists()], run)
-    if has_masks(dense_dir):
-        run.map(Task(mask_depths, dense_dir), views, "masking depth maps")
+        drop_skies(dense_dir, [view for view in views if dense.map_file(dense_dir, view).exists()], run)
+    if dense.has_masks(dense_dir):
+        run.map(Task(dense.mask_depths, dense_dir), views, "masking depth maps")
     record(dense_dir, views, rejections, run)
-    drop_estimates(dense_dir, views)
-    write_fusion_views(dense_dir, views)
+    dense.drop_estimates(dense_dir, views)
+    dense.write_fusion_views(dense_dir, views)
     mark_finished(dense_dir)
     return dense_dir
 
@@ -71,11 +56,11 @@ def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None
         largest = run.settings.depth.max_image_size_px
         lenses = split_wide_photos(scene.model_dir, largest)
         if lenses is None:
-            undistort(scene.model_dir, run.workspace.photos, dense_dir, largest, run.workers, run.progress)
+            dense.undistort(scene.model_dir, run.workspace.photos, dense_dir, largest, run.workers, run.progress)
             if run.mask_dir is not None:
-                cameras = Shared(cameras_of_photos(scene.model_dir))
-                task = Task(undistort_mask, cameras, run.mask_dir, dense_dir)
-                run.map(task, read_views(dense_dir), "undistorting masks")
+                cameras = Shared(dense.cameras_of_photos(scene.model_dir))
+                task = Task(dense.undistort_mask, cameras, run.mask_dir, dense_dir)
+                run.map(task, dense.read_views(dense_dir), "undistorting masks")
         else:
             project = Task(_project_wide_photo, Shared(lenses), run.workspace.photos, run.mask_dir, dense_dir)
             run.map(project, write_model(scene.model_dir, lenses, dense_dir), "projecting wide photos")
@@ -108,19 +93,19 @@ def drop_skies(dense_dir: Path, views: Sequence[View], run: RunContext) -> None:
 
 def find_blank_areas(dense_dir: Path, view: View) -> PhotoAreas:
     """Return the blank areas of a photo with a map."""
-    return blank_areas(read_gray(dense_dir, view), read_depth(dense_dir, view, "geometric"))
+    return blank_areas(dense.read_gray(dense_dir, view), dense.read_depth(dense_dir, view, "geometric"))
 
 
 def _count_votes(photos: Shared[tuple[Sequence[PhotoAreas], Sequence[View]]], index: int) -> FloatArray:
     return count_votes(*photos.value, index)
 
 
-def _drop_sky(dense_dir: Path, skies: Shared[Mapping[str, NDArray[np.bool_]]], photo: tuple[int, View]) -> float:
+def _drop_sky(dense_dir: Path, skies: Shared[Mapping[str, BoolArray]], photo: tuple[int, View]) -> float:
     """Remove the depths of the sky of one photo, and return its share of the photo."""
     number, view = photo
-    sky = sky_pixels(read_gray(dense_dir, view), skies.value[str(number)])
-    depth = read_depth(dense_dir, view, "geometric")
-    write_depth(dense_dir, view, np.where(sky, np.float32(SKY), depth))
+    sky = sky_pixels(dense.read_gray(dense_dir, view), skies.value[str(number)])
+    depth = dense.read_depth(dense_dir, view, "geometric")
+    dense.write_depth(dense_dir, view, np.where(sky, np.float32(SKY), depth))
     return float(sky.mean())
 
 
@@ -128,7 +113,7 @@ def record(dense_dir: Path, views: Sequence[View], rejections: Sequence[Rejected
     """Record the photos' shares of depths and the reasons for missing maps; ReconstructionError if there is no map."""
     rejected = Counter(rejection.reason for rejection in rejections if rejection is not None)
     coverage = {
-        view.name: round(float(np.mean(read_depth(dense_dir, view, "geometric") > 0)), 3)
+        view.name: round(float(np.mean(dense.read_depth(dense_dir, view, "geometric") > 0)), 3)
         for view, rejection in zip(views, rejections, strict=True)
         if rejection is None
     }

@@ -119,4 +119,3 @@ def _fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArra
 def _min_views(views: list[View], run: RunContext) -> int:
     """Return the number of photos that have to see a fused point."""
     return min(1 + run.settings.depth.min_agreeing, len(views))
-

@@ -72,11 +72,7 @@ def _marker(run: RunContext, name: str) -> Path:
 
 @contextmanager
 def gathered_frames(source: Source, run: RunContext) -> Iterator[tuple[dict[str, float], list[UnusablePhoto]]]:
-    """Fill OUT/frames with the photos of several inputs and the frames of their videos, which are as in `video_frames`.
-
-    The videos share `max_frames` by their stated durations, or evenly where one states none. Also provide those that
-    cannot be used.
-    """
+    """Fill OUT/frames with photos and the frames of videos, as in `video_frames`; also provide unusable ones."""
     times_s, refused, counts = dict[str, float](), list[UnusablePhoto](), dict[str, Mapping[str, Any]]()
     if not any(read_choice(run, _marker(run, name)) for name in source.videos):
         shutil.rmtree(run.workspace.frames, ignore_errors=True)
@@ -257,7 +253,7 @@ def _read_photos(
     write_photo_list(photo_set, copies, run.workspace)
     run.record(usable=len(photos), cameras=len(photo_set.groups), unusable={p.name: p.reason for p in unusable})
     run.record(notes={photo.label: list(photo.notes) for photo in photos if photo.notes})
-    run.record(gps=sum(photo.gps is not None for photo in timed))
+    run.record(gps=sum(photo.gps is not None for photo in timed), missing=dict(source.missing))
     return photo_set
 
 
@@ -320,9 +316,7 @@ def lay_out_photo(photo: Photo, *, folder: Path, target: Path) -> None:
     try:
         lay_out(photo, folder, target)
     except UnreadableError as err:
-        raise InputError(
-            f"{photo.label} has changed while it was read: {err}", hint="run again once its files are restored"
-        ) from err
+        raise InputError(f"{photo.label} has changed while it was read: {err}", hint="restore it") from err
 
 
 def _copy_digest(photo: Photo, run: RunContext) -> str | None:

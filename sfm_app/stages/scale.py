@@ -6,14 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_app.colmap.model import sparse_model
+from sfm_app.frame import known_lengths
 from sfm_app.frame.control_points import ControlFit, find_mistake, fit_control_points
-from sfm_app.frame.known_lengths import (
-    control_places,
-    distance_evidence,
-    is_normalized,
-    marker_evidence,
-    marks_in_pixels,
-)
 from sfm_app.frame.scale import GPS, MetricFrame, ScaleEvidence, agree, move_model
 from sfm_app.frame.sighted_points import PosedPhotos
 from sfm_app.products import write_frame
@@ -37,9 +31,9 @@ def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
     if options.distances or options.markers or run.control_points:
         posed = PosedPhotos(scene.model_dir)
         if options.distances:
-            evidence += distance_evidence(options.distances, posed.sightlines())
+            evidence += known_lengths.distance_evidence(options.distances, posed.sightlines())
         if options.markers:
-            evidence += marker_evidence(posed, run, problems)
+            evidence += known_lengths.marker_evidence(posed, run, problems)
         if run.control_points:
             control = _control_evidence(photos, posed, run, evidence, problems)
     # the proportions are as exact as the least exact focal length
@@ -75,13 +69,13 @@ def _control_evidence(
 ) -> ControlFit | None:
     """Return the fit to ground control points, and add to the evidence and the problems."""
     given = run.control_points
-    if is_normalized(given):
-        given = marks_in_pixels(photos, given)
-        fit = fit_control_points(given, control_places(photos, posed, given, []))
+    if known_lengths.is_normalized(given):
+        given = known_lengths.marks_in_pixels(photos, given)
+        fit = fit_control_points(given, known_lengths.control_places(photos, posed, given, []))
         reason = fit if isinstance(fit, str) else f"so read, the points miss by {format_length(fit.rms_m)}"
         problems.append(f"all marks lie between 0 and 1, as shares of width and height ({reason}): write pixels")
         return None
-    located = control_places(photos, posed, given, problems)
+    located = known_lengths.control_places(photos, posed, given, problems)
     fit = fit_control_points(given, located)
     if isinstance(fit, str):
         problems.append(fit)

@@ -57,10 +57,7 @@ def _adjust_models(
 ) -> tuple[list[Adjustment], dict[str, Json]]:
     """Return the adjusted models, and the manifest's entry about the rolling shutter of the first, if it has one."""
     database, family = outcome.run.workspace.database, run.settings.scene.camera_model
-    rules = [
-        camera_rules(attempt.model, names, outcome.calibrated, outcome.evidence.matches, family)
-        for attempt in outcome.models
-    ]
+    rules = [camera_rules(a.model, names, outcome.calibrated, outcome.evidence.matches, family) for a in outcome.models]
     tries = run.settings.scene.tries
     with run.step("adjusting all cameras"):
         adjusted = [

@@ -20,6 +20,7 @@ from sfm_app.texture.assemble import texture_surface
 from sfm_app.texture.normal_map import bake_normals
 from sfm_app.texture.views import PhotoView, part_view, photo_view
 from sfm_app.types import Model, Scene, Surface
+from sfm_app.types.arrays import BoolArray, ByteArray
 
 PARTS = "parts"
 """Folder of the finished work on each photo, while the texture is made."""
@@ -35,8 +36,6 @@ def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
     is_hidden = Occluders(surface.vertices, surface.faces).is_hidden
     store = FileStore(run.workspace.photos, parts, run.mask_dir)
     options = run.settings.texture
-    if run.settings.mesh.watertight:  # a closed surface has no borders
-        options = options.model_copy(update={"trim_borders": False})
     model, figures = texture_surface(surface, views, store, is_hidden, options, run.map)
     run.record(**figures)
     model = _add_normal_map(model, run) if run.settings.texture.normal_map else model
@@ -59,7 +58,7 @@ class FileStore:
     def __init__(self, photo_dir: Path, folder: Path, mask_dir: Path | None = None) -> None:
         self.photo_dir, self.folder, self.mask_dir = photo_dir, folder, mask_dir
 
-    def photo(self, view: PhotoView) -> NDArray[np.uint8]:
+    def photo(self, view: PhotoView) -> ByteArray:
         """Return the RGB picture (H, W, 3) of a view, scaled down by averaging; masked pixels are filled."""
         with Image.open(self.photo_dir / view.photo) as image:
             photo = np.asarray(image.convert("RGB"))
@@ -72,7 +71,7 @@ class FileStore:
             photo = np.asarray(Image.fromarray(photo).resize((view.width, view.height), Image.Resampling.BOX))
         return photo
 
-    def usable_pixels(self, view: PhotoView) -> NDArray[np.bool_] | None:
+    def usable_pixels(self, view: PhotoView) -> BoolArray | None:
         """Return the usable pixels (H, W) of a view; None without masks."""
         if self.mask_dir is None:
             return None

@@ -101,9 +101,7 @@ def span(
         through += verdict == SEEN_THROUGH
         seen.append(np.flatnonzero(verdict == CONFIRMED))
     witnesses = [
-        view
-        for view, at in zip(evidence.views, seen, strict=True)
-        if np.count_nonzero(at < own) >= LEAST_CONFIRMED
+        view for view, at in zip(evidence.views, seen, strict=True) if np.count_nonzero(at < own) >= LEAST_CONFIRMED
     ]
     kept = (confirmed > 0) & (through <= confirmed)
     if np.count_nonzero(kept) < 5:
@@ -154,9 +152,7 @@ def drop_guesses(surface: Surface, step: FloatArray, evidence: Evidence) -> Surf
     return select_faces(surface, keep)
 
 
-def _ask_photos(
-    points: FloatArray, normals: FloatArray, evidence: Evidence
-) -> tuple[FloatArray, NDArray[np.bool_]]:
+def _ask_photos(points: FloatArray, normals: FloatArray, evidence: Evidence) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Return (N,) the largest cosine between the normal and the direction to a photo that shows nothing else there.
 
     Also return (N,) whether more photos see through the point. Points (N, 3) and unit normals (N, 3).

@@ -131,10 +131,7 @@ class Views:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArcOptions:
-    """A hand-held walk around the front of a scene: distance, height, aim and roll vary from photo to photo.
-
-    They vary because a circle around a point that all photos look at (an orbit) leaves the focal length undetermined.
-    """
+    """A hand-held walk around the front of a scene: distance, height, aim and roll vary from photo to photo."""
 
     photos: int = 12
     """>= 2."""
@@ -228,11 +225,7 @@ def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Vie
 
 
 def look_at(center: FloatArray, aim: FloatArray, roll_deg: float = 0.0) -> FloatArray:
-    """Return (3, 4) cam_from_world of a camera that looks at a point, world y up.
-
-    Raises:
-        ValueError: the camera looks straight up or down, so that its roll is undefined.
-    """
+    """Return (3, 4) cam_from_world of a camera that looks at a point, y up; ValueError for straight up or down."""
     forward = _unit(np.asarray(aim, dtype=np.float64) - center)
     right = np.cross(forward, [0.0, 1.0, 0.0])
     if np.linalg.norm(right) < 1e-9:

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.camera.models import camera_matrix
 from sfm_app.errors import ConfigError
 from sfm_app.geometry.epipolar import fundamental_from_pose
 from sfm_app.synthetic.cameras import axis_rotation, check_ranges
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray
 
 Poses = tuple[FloatArray, FloatArray]
 
@@ -115,7 +114,7 @@ class TwoViews:
     x1: FloatArray
     x2: FloatArray
     """(N, 2) pixels; row k of x2 matches row k of x1."""
-    is_inlier: NDArray[np.bool_]
+    is_inlier: BoolArray
     """(N,): False where x2 was displaced. An outlier may still lie near its epipolar line by chance."""
     F: FloatArray
     """(3, 3) from the cameras; x2' F x1 = 0 without noise, rank 2, Frobenius norm 1."""
@@ -181,10 +180,7 @@ def make_pair(options: PairOptions, seed: int, max_setups: int = MAX_SETUPS) -> 
 
 
 def make_tracks(options: TrackOptions, seed: int, max_setups: int = MAX_SETUPS) -> Tracks:
-    """Draw cameras of one random K around a common pose, and points that all of them see, as in thesis 5.5.3.
-
-    The orientations are perturbed like the locations, since cameras that only shift leave K undetermined.
-    """
+    """Draw cameras of one random K around a common pose, and points that all of them see, as in thesis 5.5.3."""
     rng = np.random.default_rng([seed, 553])
     size = (options.width, options.height)
     for _ in range(max_setups):
@@ -243,7 +239,7 @@ def _two_views(
 
 def _with_outliers(
     x: FloatArray, share: float, reach_px: float, rng: np.random.Generator
-) -> tuple[FloatArray, NDArray[np.bool_]]:
+) -> tuple[FloatArray, BoolArray]:
     is_inlier = np.ones(len(x), dtype=np.bool_)
     is_inlier[rng.permutation(len(x))[: round(share * len(x))]] = False
     displaced = x.copy()
@@ -276,7 +272,7 @@ def _candidates(Ks: FloatArray, poses: Poses, size: tuple[int, int], rng: np.ran
         yield (rays * depth - poses[1][0]) @ poses[0][0]
 
 
-def _is_in_all_views(Ks: FloatArray, poses: Poses, size: tuple[int, int], X: FloatArray) -> NDArray[np.bool_]:
+def _is_in_all_views(Ks: FloatArray, poses: Poses, size: tuple[int, int], X: FloatArray) -> BoolArray:
     camera = np.einsum("cij,nj->cni", poses[0], X) + poses[1][:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         x = _project(Ks, poses, X)

@@ -10,7 +10,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.errors import InputError
@@ -20,7 +19,7 @@ from sfm_app.progress import Progress, track
 from sfm_app.synthetic.cameras import Camera, Lens, Views, check_ranges
 from sfm_app.synthetic.render import GAMMA, prepare, render_scene
 from sfm_app.synthetic.shapes import SyntheticScene
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import ByteArray, FloatArray, IndexArray
 from sfm_app.types.scene import camera_center
 
 TRUTH_FILE, SURFACE_FILE = "truth.json", "surface.ply"
@@ -63,7 +62,7 @@ class Truth:
     """By photo name: (3, 4) [R | t]."""
     vertices: FloatArray
     """(V, 3) vertices of the surface, y up."""
-    faces: NDArray[np.int64]
+    faces: IndexArray
     """(T, 3) vertex indices."""
 
     @property
@@ -89,11 +88,7 @@ def write_photo_folder(
     folder: Path, scene: SyntheticScene, views: Views, options: PhotoOptions | None = None, processes: int = 1,
     progress: Progress | None = None,
 ) -> Truth:  # fmt: skip
-    """Render the missing photos of a folder, a JPEG without EXIF per view; `save_truth` writes the truth elsewhere.
-
-    Other photos of the folder must be of the same scene, views and options, which is not checked. A script with more
-    than one process needs a `__main__` guard.
-    """
+    """Render the missing photos of a folder, a JPEG without EXIF per view; `save_truth` writes the truth elsewhere."""
     missing = [k for k, name in enumerate(views.cam_from_world) if not (folder / name).exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -142,7 +137,7 @@ def _write_in_process(number: int) -> None:
     _WORK[0].write_photo(number)
 
 
-def develop(image: FloatArray, options: PhotoOptions, rng: np.random.Generator) -> NDArray[np.uint8]:
+def develop(image: FloatArray, options: PhotoOptions, rng: np.random.Generator) -> ByteArray:
     """Return an image (H, W, 3) of linear RGB, about 0..1, exposed and blurred, with gamma and noise, in 8 bits."""
     if options.exposure_ev > 0:
         image = image * 2.0 ** rng.normal(scale=options.exposure_ev)
@@ -200,7 +195,7 @@ def _camera_from_dict(image: Mapping[str, Any]) -> Camera:
     return Camera(K, int(image["width"]), int(image["height"]), lens)
 
 
-def _to_ply(vertices: FloatArray, faces: NDArray[np.int64]) -> bytes:
+def _to_ply(vertices: FloatArray, faces: IndexArray) -> bytes:
     header = (
         "ply\nformat binary_little_endian 1.0\n"
         f"element vertex {len(vertices)}\nproperty double x\nproperty double y\nproperty double z\n"
@@ -209,7 +204,7 @@ def _to_ply(vertices: FloatArray, faces: NDArray[np.int64]) -> bytes:
     return header.encode("ascii") + vertices.astype("<f8").tobytes() + triangles(faces).tobytes()
 
 
-def _from_ply(data: bytes) -> tuple[FloatArray, NDArray[np.int64]]:
+def _from_ply(data: bytes) -> tuple[FloatArray, IndexArray]:
     end = data.index(b"end_header\n") + len(b"end_header\n")
     lines = data[:end].decode("ascii").splitlines()
     counts = [int(line.split()[2]) for line in lines if line.startswith("element")]

@@ -12,7 +12,7 @@ from sfm_app.meshing.ray_casting import load_open3d
 from sfm_app.synthetic.cameras import Camera, pixel_rays
 from sfm_app.synthetic.shapes import SyntheticScene, mixture
 from sfm_app.types import Surface
-from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 from sfm_app.types.scene import camera_center
 from sfm_app.types.surface import Model, Texture
 
@@ -31,10 +31,10 @@ class PreparedScene:
 
     rays: Any
     """Open3D RaycastingScene."""
-    faces: NDArray[np.int64]
+    faces: IndexArray
     vertex_table: FloatArray
     """(V, 7): normal, texture coordinates, and the visible share of the sky (ambient occlusion)."""
-    face_material: NDArray[np.int64]
+    face_material: IndexArray
     materials: FloatArray
     lights: FloatArray
     """(5, 3): direction to the sun, sun and sky colors, zenith and horizon colors."""
@@ -95,7 +95,7 @@ def _to_world(rays: FloatArray, cam_from_world: FloatArray) -> tuple[FloatArray,
     return -np.einsum("nji,nj->ni", R, poses[:, :, 3]), np.einsum("nj,nji->ni", rays, R)
 
 
-def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:
+def ray_caster(vertices: FloatArray, faces: IndexArray) -> Any:
     """Return Open3D's RaycastingScene of triangles (T, 3) of vertices (V, 3), in single precision."""
     open3d = load_open3d()
     caster = open3d.t.geometry.RaycastingScene()
@@ -115,7 +115,7 @@ def cast_rays(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[s
 
 def _is_sunlit(
     scene: PreparedScene, center: FloatArray, directions: FloatArray, hits: dict[str, NDArray[Any]]
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Return whether the sun reaches each hit; shadow rays are cast only where the surface faces the sun."""
     sun = scene.lights[0]
     lit = hits["primitive_normals"] @ sun.astype(np.float32) > 0
@@ -148,7 +148,7 @@ def _openness(caster: Any, vertices: FloatArray, normals: FloatArray) -> FloatAr
 
 
 @kernel
-def shade(hits: Any, tables: Any, total: NDArray[np.float64]) -> None:
+def shade(hits: Any, tables: Any, total: FloatArray) -> None:
     """Add the color of every ray to `total`.
 
     Args:
@@ -213,10 +213,7 @@ class Picture:
 
 
 def render_model(prepared: PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
-    """Render the model at a pose (3, 4), unlit in the colors of its texture or else of its vertices, from both sides.
-
-    Each pixel is sampled once at its center, so a texture much finer than the pixels causes aliasing.
-    """
+    """Render the model at a pose (3, 4), unlit in the colors of its texture or vertices, from both sides."""
     directions = pixel_rays(camera) @ cam_from_world[:, :3]
     return render_rays(prepared, camera_center(cam_from_world), directions.reshape(camera.height, camera.width, 3))
 
@@ -279,7 +276,7 @@ def orbited_pose(pose: FloatArray, surface: Surface, angle_deg: float) -> FloatA
     return np.column_stack([turned, R @ middle + t - turned @ middle])
 
 
-def _texture_colors(texture: Texture, face: NDArray[np.int64], weights: FloatArray) -> Colors:
+def _texture_colors(texture: Texture, face: IndexArray, weights: FloatArray) -> Colors:
     """Sample the texture bilinearly; texel centers at +0.5, the border repeated."""
     place = np.einsum("hwk,hwkc->hwc", weights, texture.uv[face].astype(np.float64))
     page_of = texture.page[face]

@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.synthetic.cameras import ArcOptions, Camera, Views, arc
 from sfm_app.synthetic.shapes import (
@@ -148,11 +147,11 @@ def _round_objects() -> list[Body]:
     return bodies
 
 
-def _profile(radius: tuple[float, ...], height: tuple[float, ...]) -> NDArray[np.float64]:
+def _profile(radius: tuple[float, ...], height: tuple[float, ...]) -> FloatArray:
     return np.column_stack([radius, height])
 
 
-def _catmull_rom(knots: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
+def _catmull_rom(knots: FloatArray, steps: int) -> FloatArray:
     # Catmull-Rom through the knots, ends doubled
     p = np.concatenate([knots[:1], knots, knots[-1:]])
     u = np.linspace(0.0, 1.0, steps, endpoint=False)[None, :, None]

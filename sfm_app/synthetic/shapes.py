@@ -12,11 +12,10 @@ from typing import Literal, get_args
 
 import numpy as np
 from numba import uint32
-from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.synthetic.cameras import axis_rotation
-from sfm_app.types.arrays import FloatArray, IndexArray
+from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,7 +160,7 @@ def _outer_radius(
 ) -> FloatArray:
     """Return the radius (N,) at which rays along -`directions` (N, 3) enter the body at a level; 0 for misses."""
 
-    def is_inside(radius: FloatArray) -> NDArray[np.bool_]:
+    def is_inside(radius: FloatArray) -> BoolArray:
         points = directions[:, None] * radius[..., None] + np.array([0.0, level, 0.0])
         return np.asarray(field(points.reshape(-1, 3)).reshape(radius.shape) > 0)
 
@@ -279,10 +278,7 @@ def octaves(p: tuple[float, float, float], size: float, gain: float, footprint: 
 
 @kernel
 def cells(a: float, b: float, seed: int) -> tuple[float, float]:
-    """Return border distance and number of the cell at a point, for random cells in the plane.
-
-    The distance is in cells; the number, in [0, 1), identifies the cell.
-    """
+    """Return border distance and number, in [0, 1), of the cell at a point, for random cells in the plane."""
     ia, ib = math.floor(a), math.floor(b)
     first, second, name = 9.0, 9.0, 0.0
     for i in range(ia - 1, ia + 2):
@@ -336,10 +332,7 @@ def tiles(
 
 @kernel
 def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
-    """Return the shares of the second color (glaze) and of the thin lines on Greek pottery, with bands of one height.
-
-    Bands follow the height, figures the angle about the y axis.
-    """
+    """Return the shares of the second color (glaze) and of thin lines on Greek pottery, in bands of one height."""
     band = p[1] / scale
     row = math.floor(band)
     inside = band - row
@@ -361,7 +354,7 @@ def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
 
 @kernel
 def mixture(
-    row: NDArray[np.float64], p: tuple[float, float, float], n: tuple[float, float, float], footprint: float
+    row: FloatArray, p: tuple[float, float, float], n: tuple[float, float, float], footprint: float
 ) -> tuple[float, float, float]:
     """Return shares of the second and the joint color, and brightness (about 1), at a point of a body before `move`."""
     kind, scale, contrast, seed = int(row[0]), row[1], row[2], int(row[3])
@@ -435,6 +428,6 @@ class SyntheticScene:
         return np.concatenate([body.shape.vertices for body in self.bodies])
 
     @property
-    def faces(self) -> NDArray[np.int64]:
+    def faces(self) -> IndexArray:
         """(T, 3) vertex indices of all bodies."""
         return _stack([(body.shape.vertices, body.shape.faces) for body in self.bodies])[1]

@@ -1,4 +1,4 @@
-"""Agreement of the photos of a surface: outliers, doubtful borders, exposure."""
+"""Agreement of the photos of a surface: outliers, exposure."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.least_squares import solve_positive
 from sfm_app.jit import kernel
-from sfm_app.texture.sightings import NONE, IntArray, Sightings, components, ranges
+from sfm_app.texture.sightings import NONE, IntArray, Sightings, ranges
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 LEAST_VIEWS = 3
@@ -16,21 +16,6 @@ LEVELS = 10.0
 """Normal difference between colors of one triangle, in gray levels."""
 OUTLIER_FACTOR = 3.0
 """Deviation of an outlier, relative to the median deviation of the triangle."""
-
-
-@dataclass(frozen=True, slots=True)
-class BorderOptions:
-    """Which triangles are cut from the border of a surface."""
-
-    doubtful: float = 5.0
-    """Disagreement of a doubtful triangle, in medians of all triangles. Chosen by photos left out of
-    fountain-P11 and Herz-Jesus-P8, and on `railing`, where 3.5 cuts a sixth of the rods instead of a twentieth."""
-    rings: int = 20
-    """Most rings of triangles cut from the border: hedges and water stay."""
-    smoothing: int = 2
-    """Rounds of averaging the disagreement over neighbors, and of straightening the cut."""
-    crumbs: int = 20
-    """Parts with fewer triangles are cut with the border beside them. Chosen on `railing`: 200 cuts pieces of rods."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +34,6 @@ class GainOptions:
     """Weight of "no gain", as a share of the mean weight of a photo: keeps undetermined gains at 1."""
 
 
-BORDERS = BorderOptions()
 GAINS = GainOptions()
 
 
@@ -136,61 +120,6 @@ def _deviations(
             deviation[here[k]] = far[k] / median_far
 
 
-# Borders without a surface: depth maps reach over the outlines of objects, by the same pixels in every photo, so that
-# they agree with each other. But behind the outline each photo shows another part of the background.
-
-
-def doubtful_border(sightings: Sightings, gains: FloatArray, neighbors: IntArray) -> BoolArray:
-    """Mark triangles to cut from the border, (T,): photos disagree about them more than about the surface elsewhere."""
-    disagreement = np.full(sightings.triangles, np.nan)
-    _disagreement(
-        sightings.face_starts,
-        sightings.face_rows,
-        sightings.score,
-        sightings.colors,
-        sightings.photo,
-        1.0 / gains,
-        disagreement,
-    )
-    if not np.isfinite(disagreement).any():
-        return np.zeros(sightings.triangles, np.bool_)
-    middle = float(np.nanmedian(disagreement))
-    for _ in range(BORDERS.smoothing):
-        disagreement = _average_known(disagreement, neighbors)
-    doubtful = disagreement > max(BORDERS.doubtful * middle, LEVELS)
-    cut = _straighten(_grow_from_border(doubtful, neighbors), neighbors)
-    # small connected parts beside the cut
-    part, count = components(np.where(cut, NONE, 0), neighbors)
-    beside_cut = ~cut & ((neighbors != NONE) & cut[neighbors]).any(axis=1)
-    crumb = np.bincount(part[~cut], minlength=count) < BORDERS.crumbs
-    crumb &= np.bincount(part[beside_cut], minlength=count) > 0
-    return np.asarray(cut | (~cut & crumb[part]), np.bool_)
-
-
-@kernel
-def _disagreement(
-    starts: IndexArray, rows: IndexArray, score: NDArray[np.float32], colors: NDArray[np.uint8],
-    photo: IntArray, scale: FloatArray, disagreement: FloatArray,
-) -> None:  # fmt: skip
-    """Write the mean deviation of the views of each triangle from their median color, in gray levels."""
-    level, far, used = np.empty(len(scale)), np.empty(len(scale)), np.empty(len(scale), np.int64)
-    for f in range(len(starts) - 1):
-        count = outliers = 0
-        for row in rows[starts[f] : starts[f + 1]]:
-            outliers += score[row] < 0
-        for row in rows[starts[f] : starts[f + 1]]:
-            # one photo may show a passer-by; more outliers count as disagreement
-            if score[row] > 0 or outliers > 1:
-                used[count] = row
-                count += 1
-        if count < 2:
-            continue
-        _measure_deviations(used[:count], colors, photo, scale, level, far)
-        disagreement[f] = 0.0
-        for k in range(count):
-            disagreement[f] += far[k] / count
-
-
 def _average_known(values: NDArray[np.floating], neighbors: IntArray) -> FloatArray:
     known = np.isfinite(values)
     total, count = np.where(known, values, 0.0), known.astype(np.float64)
@@ -199,29 +128,6 @@ def _average_known(values: NDArray[np.floating], neighbors: IntArray) -> FloatAr
         total += np.where(usable, values[beside], 0.0)
         count += usable
     return np.asarray(np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0))
-
-
-def _grow_from_border(doubtful: BoolArray, neighbors: IntArray) -> BoolArray:
-    """Return (T,) the doubtful triangles connected with the border by doubtful ones, ring by ring."""
-    front = doubtful & (neighbors == NONE).any(axis=1)
-    region = front.copy()
-    for _ in range(BORDERS.rings):
-        beside = neighbors[front]
-        near = np.zeros(len(region), np.bool_)
-        near[beside[beside != NONE]] = True
-        front = near & doubtful & ~region
-        region |= front
-    return np.asarray(region, np.bool_)
-
-
-def _straighten(cut: BoolArray, neighbors: IntArray) -> BoolArray:
-    """Return (T,) the cut with spikes: triangles with two open sides."""
-    cut = cut.copy()
-    for _ in range(BORDERS.smoothing):
-        beside = (neighbors != NONE) & cut[neighbors]
-        is_open = beside | (neighbors == NONE)
-        cut |= beside.any(axis=1) & (is_open.sum(axis=1) >= 2)
-    return np.asarray(cut, np.bool_)
 
 
 # Exposure and white balance of the photos, from triangles in several of them.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sfm_app.geometry.triangles import select_faces, split_fans
 from sfm_app.settings import TextureSettings
 from sfm_app.tasks import ParallelMap
-from sfm_app.texture.appearance import doubtful_border, outlier_mask, photo_gains
+from sfm_app.texture.appearance import outlier_mask, photo_gains
 from sfm_app.texture.charts import (
     SQUARE_CORNERS,
     Charts,
@@ -60,10 +60,7 @@ def texture_surface(
     face_views = spread(
         partial(_score_photo, views, store, mesh, hidden), range(len(views)), "finding visible triangles"
     )
-    checked, trimmed = _check_views(face_views, mesh), 0
-    if options.trim_borders:
-        border = doubtful_border(checked.sightings, checked.gains, mesh.neighbors)
-        mesh, checked, trimmed = *_cut_faces(border, mesh, checked), int(border.sum())
+    checked = _check_views(face_views, mesh)
     chosen = absorb_small_charts(choose_photos(checked.sightings, mesh), checked.sightings, mesh.neighbors)
     unseen = chosen == NONE
     if options.unseen_faces == "cut" and not unseen.all():
@@ -79,7 +76,6 @@ def texture_surface(
         "texels": sum(width * height for width, height in plan.layout.sizes),
         "scale": round(plan.layout.scale, 3),
         "unseen_triangles": int(unseen.sum()),
-        "trimmed_triangles": trimmed,
         "strange_views_of_triangles": plan.checked.outliers,
         "gains": {
             view.name: [round(float(gain), 3) for gain in gains]

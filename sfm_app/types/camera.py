@@ -6,9 +6,9 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.numerical import finite_entries
+from sfm_app.types.arrays import FloatArray
 from sfm_app.types.photos import CameraPrior, MatchedImage, PairId, Photo
 
 PERSPECTIVE, FISHEYE, EQUIRECTANGULAR = "perspective", "fisheye", "equirectangular"
@@ -22,7 +22,7 @@ not determine the camera."""
 class Calibration:
     """One camera matrix with its evidence."""
 
-    K: NDArray[np.float64]
+    K: FloatArray
     """(3, 3) camera matrix in pixels, zero skew: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."""
     width: int
     height: int
@@ -141,7 +141,7 @@ class Intrinsics:
         return next(iter(self.cameras.values()))
 
     @property
-    def K(self) -> NDArray[np.float64]:
+    def K(self) -> FloatArray:
         """(3, 3) camera matrix of the camera that took the most photos."""
         return self.main.K
 
@@ -171,7 +171,7 @@ def correlation_key(first: str, second: str) -> str:
     return f"{first} {second}"
 
 
-def named_correlations(names: Sequence[str], covariance: NDArray[np.float64]) -> dict[str, float]:
+def named_correlations(names: Sequence[str], covariance: FloatArray) -> dict[str, float]:
     """Return the correlations of parameters with variances > 0, by `correlation_key`, from a covariance (n, n)."""
     variances = np.diag(covariance)
     known = [k for k in range(len(names)) if np.isfinite(variances[k]) and variances[k] > 0.0]

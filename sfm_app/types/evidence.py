@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfm_app.numerical import json_text
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray
 from sfm_app.types.camera import Calibration, Intrinsics
 from sfm_app.types.photos import CameraPrior, MatchGraph, PairId, join_priors
 
@@ -19,11 +19,11 @@ from sfm_app.types.photos import CameraPrior, MatchGraph, PairId, join_priors
 class EpipolarGeometry:
     """The matrix of a pair with its evidence: an `EpipolarFit` or a `RayFit`."""
 
-    matrix: NDArray[np.float64]
+    matrix: FloatArray
     """(3, 3), rank 2, Frobenius norm 1."""
-    inliers: NDArray[np.bool_]
+    inliers: BoolArray
     """(N,) per match: within the threshold of the matrix."""
-    priors: NDArray[np.float64]
+    priors: FloatArray
     """(N,) in [0, 1] per match: its validity according to the estimator; p(v_i) of the thesis, largest value 1."""
     trials: int
     rms_px: float
@@ -43,7 +43,7 @@ class EpipolarFit(EpipolarGeometry):
     __slots__ = ()
 
     @property
-    def F(self) -> NDArray[np.float64]:
+    def F(self) -> FloatArray:
         """(3, 3), rank 2, Frobenius norm 1; x2' F x1 = 0 in pixels."""
         return self.matrix
 
@@ -54,7 +54,7 @@ class RayFit(EpipolarGeometry):
     __slots__ = ()
 
     @property
-    def E(self) -> NDArray[np.float64]:
+    def E(self) -> FloatArray:
         """(3, 3), Frobenius norm 1; q' E p = 0 for bearing vectors p of view 1 and q of view 2."""
         return self.matrix
 
@@ -138,15 +138,15 @@ def _pair(row: NDArray[np.uint32]) -> PairId:
 class CameraPairs:
     """Fundamental matrices of pairs with the same camera, and data of each; `selfcal.pairs.prepare` checks them."""
 
-    Fs: NDArray[np.float64]
+    Fs: FloatArray
     """(P, 3, 3) in pixels, x2' F x1 = 0, any scale."""
-    weights: NDArray[np.float64]
+    weights: FloatArray
     """(P,) >= 0, weight of each F."""
     size: tuple[int, int]
     """(width, height) of the photos in pixels."""
     photos: tuple[PairId, ...] = ()
     """Per pair the ids of its two photos; empty where they are unknown."""
-    inliers: tuple[NDArray[np.float64], ...] = ()
+    inliers: tuple[FloatArray, ...] = ()
     """Per pair (N, 4) x1, y1, x2, y2 in pixels: the matches behind F; empty where only the Fs are known."""
     prior: CameraPrior | None = None
 
@@ -161,12 +161,12 @@ class CameraPairs:
 class PhotoPairs:
     """All pairs of a set of photos, which may be of several cameras."""
 
-    Fs: NDArray[np.float64]
+    Fs: FloatArray
     """(P, 3, 3) in pixels, x2' F x1 = 0, any scale."""
-    weights: NDArray[np.float64]
+    weights: FloatArray
     """(P,) >= 0, weight of each F."""
     photos: tuple[PairId, ...]
-    inliers: tuple[NDArray[np.float64], ...]
+    inliers: tuple[FloatArray, ...]
     """Per pair (N, 4) x1, y1, x2, y2 in pixels."""
     sizes: Mapping[int, tuple[int, int]]
     """(width, height) in pixels by photo."""
@@ -216,7 +216,7 @@ class RelativePose:
     """(3, 3) rotation."""
     t: FloatArray
     """(3,) direction of the translation, length 1."""
-    inliers: NDArray[np.bool_]
+    inliers: BoolArray
     """(M,) per match of the pair: within the threshold of this pose."""
     angle_deg: float
     """Median triangulation angle of the inliers before both cameras."""

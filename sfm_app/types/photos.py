@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.types.arrays import FloatArray
+
 Frame = tuple[int, int, int, int]
 """Left, top, width and height of a part of a photo, in pixels."""
 
@@ -58,10 +60,7 @@ class CameraPrior:
 
 
 def join_priors(priors: Sequence[CameraPrior]) -> CameraPrior | None:
-    """Return the claim about a camera from those about its photos: medians, whose errors do not average out.
-
-    Deviations cover the scatter between the photos.
-    """
+    """Return the claim about a camera from those about its photos: medians, whose errors do not average out."""
     if not priors:
         return None
     focal_px, focal_deviation_px = _median([(one.focal_px, one.focal_deviation_px) for one in priors])
@@ -198,7 +197,7 @@ class Features:
 
     size: tuple[int, int]
     """Width and height of the picture in pixels."""
-    keypoints: NDArray[np.float64]
+    keypoints: FloatArray
     """(N, 2) x and y in pixels of the picture; the center of the top-left pixel is (0.5, 0.5)."""
     values: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Descriptors, scores and the like, with N rows each."""
@@ -241,7 +240,7 @@ class MatchGraph:
     """Photos as nodes, raw matches as edges."""
 
     images: Mapping[int, MatchedImage]
-    keypoints: Mapping[int, NDArray[np.float64]]
+    keypoints: Mapping[int, FloatArray]
     """Per image id: (N, 2) pixels."""
     matches: Mapping[PairId, NDArray[np.uint32]]
     """Per pair: (M, 2) keypoint indices in image 1 and image 2."""
@@ -265,7 +264,7 @@ class MatchGraph:
         """Return the names of photos."""
         return [self.images[photo].name for photo in photos]
 
-    def points(self, pair: PairId) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def points(self, pair: PairId) -> tuple[FloatArray, FloatArray]:
         """Return the matched points of one pair: x1, x2, each (M, 2) pixels."""
         rows = self.matches[pair]
         return self.keypoints[pair[0]][rows[:, 0]], self.keypoints[pair[1]][rows[:, 1]]

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import ByteArray, FloatArray, IndexArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,7 +18,7 @@ class CameraModel:
     """COLMAP's name of the camera model: OPENCV, FULL_OPENCV, OPENCV_FISHEYE, THIN_PRISM_FISHEYE, EQUIRECTANGULAR."""
     params: tuple[float, ...]
     """COLMAP's parameters of that model."""
-    K: NDArray[np.float64]
+    K: FloatArray
     width: int
     height: int
     deviations: Mapping[str, float] = field(default_factory=dict)
@@ -121,7 +120,7 @@ class Scene:
     """A COLMAP model on disk, with the figures of its summary."""
 
     model_dir: Path
-    cam_from_world: Mapping[str, NDArray[np.float64]]
+    cam_from_world: Mapping[str, FloatArray]
     """By name of a photo that has a pose: (3, 4) [R | t]."""
     unregistered: Mapping[str, str]
     """Names of the photos without a pose, with the reason."""
@@ -174,11 +173,11 @@ class ControlPoints:
 class PointCloud:
     """Colored points in the frame of the export."""
 
-    points: NDArray[np.float64]
+    points: FloatArray
     """(P, 3)"""
-    colors: NDArray[np.uint8]
+    colors: ByteArray
     """(P, 3) RGB."""
-    normals: NDArray[np.float64] | None = None
+    normals: FloatArray | None = None
     """(P, 3) unit vectors; None where unknown."""
 
 
@@ -203,29 +202,29 @@ class SceneArrays:
 
     photos: tuple[str, ...]
     """(N) names of the photos that have a pose."""
-    cam_from_world: NDArray[np.float64]
+    cam_from_world: FloatArray
     """(N, 3, 4) [R | t]; x right, y down, z forward in the camera."""
-    K: NDArray[np.float64]
+    K: FloatArray
     """(N, 3, 3) camera matrix of each photo in pixels; pixel centers at +0.5."""
-    sizes: NDArray[np.int64]
+    sizes: IndexArray
     """(N, 2) width and height in pixels."""
-    points: NDArray[np.float64]
+    points: FloatArray
     """(P, 3)."""
-    colors: NDArray[np.uint8]
+    colors: ByteArray
     """(P, 3) RGB."""
-    errors_px: NDArray[np.float64]
+    errors_px: FloatArray
     """(P,) mean reprojection error of each point."""
-    track_points: NDArray[np.int64]
+    track_points: IndexArray
     """(M,) row of the point of each observation, ascending."""
-    track_photos: NDArray[np.int64]
+    track_photos: IndexArray
     """(M,) row of its photo."""
-    track_pixels: NDArray[np.float64]
+    track_pixels: FloatArray
     """(M, 2) pixels of the keypoints, with the distortion of the lens."""
     metric: bool
     """Whether the unit is the meter."""
 
     @property
-    def centers(self) -> NDArray[np.float64]:
+    def centers(self) -> FloatArray:
         """(N, 3) centers of projection in the world."""
         R, t = self.cam_from_world[:, :, :3], self.cam_from_world[:, :, 3]
         return np.asarray(-np.einsum("nji,nj->ni", R, t))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.types.arrays import ByteArray, Float32Array, FloatArray, IndexArray
 from sfm_app.types.scene import PosedPhoto
 
 
@@ -12,11 +13,11 @@ from sfm_app.types.scene import PosedPhoto
 class Surface:
     """Triangles with a color per vertex, in the frame of the scene."""
 
-    vertices: NDArray[np.float64]
+    vertices: FloatArray
     """(V, 3) scene coordinates, y up."""
-    faces: NDArray[np.int64]
+    faces: IndexArray
     """(T, 3) vertex indices, counter-clockwise seen from outside."""
-    colors: NDArray[np.uint8]
+    colors: ByteArray
     """(V, 3) RGB."""
 
 
@@ -24,13 +25,13 @@ class Surface:
 class Texture:
     """Pictures for the triangles of a surface."""
 
-    uv: NDArray[np.float32]
+    uv: Float32Array
     """(T, 3, 2) place of each corner of each triangle on its page, in [0, 1]; (0, 0) is the page's top-left corner."""
     page: NDArray[np.int32]
     """(T,) page of each triangle."""
-    pages: tuple[NDArray[np.uint8], ...]
+    pages: tuple[ByteArray, ...]
     """(H, W, 3) RGB each."""
-    normal_maps: tuple[NDArray[np.uint8], ...] = ()
+    normal_maps: tuple[ByteArray, ...] = ()
     """One (h, w, 3) per page, of its proportions: normals in the frames of `geometry.triangles`, stored as glTF does:
     0.5 + 0.5 n, linear, +y up; empty without normal maps."""
 

@@ -4,6 +4,7 @@ import json
 import shutil
 import zipfile
 from contextlib import suppress
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,9 +14,11 @@ from PIL import Image
 
 from sfm_app.api import reconstruct
 from sfm_app.errors import InputError, SfmError
+from sfm_app.exports import StoredScene
 from sfm_app.photos import gather
 from sfm_app.photos.gather import expand, fill, find
-from sfm_app.runtime.workspace import LOCK
+from sfm_app.products import read_photo_list
+from sfm_app.runtime.workspace import LOCK, Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import photos as photos_stage
 
@@ -56,8 +59,8 @@ def packed(place, *files):
             made.write(path, name)
 
 
-def run(inputs, out, **photos):
-    chosen = Settings.from_mapping({"workers": 1, "report": False, "photos": photos})
+def run(inputs, out, *, report=False, **photos):
+    chosen = Settings.from_mapping({"workers": 1, "report": report, "photos": photos})
     return reconstruct(inputs, out, chosen, last="photos").manifest["stages"]["photos"]
 
 
@@ -152,6 +155,47 @@ def test_a_run_names_the_users_files_and_resumes_in_any_order_and_place(tmp_path
     assert [(tmp_path / "moved" / name).stat().st_mtime_ns for name in ("photos.json", ".inputs")] == written
     picture(9, tmp_path / "a.png")
     assert run(mixed, tmp_path / "moved")["fingerprint"] != first["fingerprint"]
+
+
+def test_the_report_and_exports_have_the_users_names(tmp_path, mixed):
+    run(mixed, tmp_path / "out", report=True)
+    page = (tmp_path / "out" / "report.html").read_text()
+    labels = [str(mixed[0]), str(mixed[1] / "b.png"), f"{mixed[2]}: in/c.png", f"{mixed[2]}: x.txt"]
+    assert all(label in page for label in labels) and ".inputs" not in page
+    scene = StoredScene.__new__(StoredScene)  # of a folder without poses
+    scene._run = SimpleNamespace(workspace=Workspace(tmp_path / "out"))
+    names = [photo.name for photo in read_photo_list(scene._run.workspace).photos]
+    scene._place, scene.images = None, {f"{number}.jpg": name for number, name in enumerate(names)}
+    scene.scene = SimpleNamespace(unregistered={})
+    assert sorted(scene.record_entries("colmap")["photo_of"].values()) == sorted(labels[:3])
+
+
+def test_a_later_run_of_one_folder_removes_what_was_gathered(tmp_path, mixed):
+    run(mixed, tmp_path / "out")
+    picture(8, mixed[1] / "d.png")
+    with FileLock(tmp_path / "out" / LOCK), pytest.raises(InputError, match="another run"):
+        run(mixed[1], tmp_path / "out")
+    assert (tmp_path / "out" / ".inputs" / "a.png").is_file()
+    assert run(mixed[1], tmp_path / "out")["counts"]["usable"] == 2
+    assert not list((tmp_path / "out").glob(".inputs*"))
+    assert run(mixed, tmp_path / "out")["counts"]["usable"] == 4
+
+
+def test_a_folder_of_videos_with_what_cameras_write_beside_them_is_one_of_videos(tmp_path):
+    (tmp_path / "films").mkdir()
+    for seed, name in enumerate(("a.avi", "b.avi")):
+        video(tmp_path / "films" / name, 20, seed)
+    shutil.copy(tmp_path / "films" / "a.avi", tmp_path / "films" / "GL1.LRV")
+    picture(1, tmp_path / "films" / "x.jpg")
+    (tmp_path / "films" / "x.jpg").rename(tmp_path / "films" / "GX1.THM")
+    for name in ("a.srt", "a.xmp", "notes.txt"):
+        (tmp_path / "films" / name).write_text("a text")
+    found = run([tmp_path / "films"], tmp_path / "out")["counts"]
+    assert found["cameras"] == 2 and found["usable"] == found["video"]["chosen"]
+    reasons = {name.rpartition("/")[2]: reason for name, reason in found["unusable"].items()}
+    assert reasons == dict.fromkeys(("GL1.LRV", "GX1.THM"), "a small copy of a video") | dict.fromkeys(
+        ("a.srt", "a.xmp", "notes.txt"), "not a photo"
+    )
 
 
 def test_inputs_stay_as_they_are_while_another_run_holds_the_folder(tmp_path, mixed):

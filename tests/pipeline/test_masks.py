@@ -54,10 +54,23 @@ def test_masks_are_counted_and_every_photo_has_one(folder, masks, tmp_path):
     mask().save(masks / "other.jpg.png")
     (masks / "notes.txt").write_text("by hand")
     result = read(folder, tmp_path / "out", "--json")
-    told = read(folder, tmp_path / "out").stdout
     assert json.loads(result.stdout)["masks"] == {"photos": 1, "unused": ["notes.txt", "other.jpg.png"]}
-    assert "masks       1 of 3 photos\n            unused: notes.txt, other.jpg.png\n" in told
     assert [used_share(tmp_path / "out", name) for name in ("a.jpg", "b.png", "sub/a.jpg")] == [1.0, 1.0, 0.5]
+
+
+def test_masks_and_positions_of_no_use_are_warnings_in_the_terminal_and_in_the_report(folder, masks, tmp_path):
+    Image.new("L", SIZE, 255).save(masks / "a.jpg.png")
+    mask().save(masks / "other.jpg.png")
+    (folder / "geo.txt").write_text("EPSG:4326\na.jpg 8.5 47.3 400\nlost.jpg 8.6 47.3 400\n")
+    told = read(folder, tmp_path / "out", "-q").stdout
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "masks       2 of 3 photos\nbeware      masks hide nothing: a.jpg\n" in told
+    for text in ("masks belong to no photo: other.jpg.png", "geo.txt names photos that are not there: lost.jpg"):
+        assert text in told and text in page
+    found = json.loads(read(folder, tmp_path / "out", "--json").stdout)
+    assert found["missing"] == {"geo.txt": ["lost.jpg"]} and found["masks"]["white"] == ["a.jpg"]
+    (folder / "geo.txt").write_text("EPSG:4326\na.jpg 8.5 47.3 400\n")
+    assert "lost.jpg" not in read(folder, tmp_path / "out", "-q").stdout
 
 
 def test_masks_beside_the_photos_in_a_folder_of_their_own_are_no_photos(folder, masks, tmp_path):

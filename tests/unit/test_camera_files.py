@@ -178,7 +178,7 @@ def test_distortion_may_be_in_terms_of_its_own(tmp_path):
 
 def test_numbers_of_an_unknown_name_may_be_the_distortion_and_are_refused(tmp_path):
     values = SIZE | {"camera_matrix": K, "coefs": OPENCV[4:]}
-    with pytest.raises(InputError, match=r"'coefs' beside the camera matrix may be its distortion"):
+    with pytest.raises(InputError, match=r"'coefs' may be the distortion"):
         given(tmp_path / "cameras.json", json.dumps(values))
     harmless = {"rvecs": [[1, 2, 3]] * 5, "rms": 0.3, "roi": [0, 0, 9, 9], "R": np.eye(3).tolist(), "P": [0.0] * 12}
     assert same_rays(only(tmp_path / "a.json", json.dumps(SIZE | {"K": K} | harmless)), "PINHOLE", OPENCV[:4])

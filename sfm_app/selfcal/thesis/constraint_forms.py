@@ -17,10 +17,9 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.settings import ConstraintForm
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import FloatArray, IndexArray
 
 _TINY = float(np.finfo(np.float64).tiny)
 """The smallest normal number in double precision; added to divisors, so that none is zero."""
@@ -89,7 +88,7 @@ class Halves:
         s = s[:, :2] / np.linalg.norm(s[:, :2], axis=1, keepdims=True)
         return cls(np.swapaxes(U, 1, 2)[:, :2], Vt[:, :2], s)
 
-    def __getitem__(self, rows: NDArray[np.int64]) -> "Halves":
+    def __getitem__(self, rows: IndexArray) -> "Halves":
         """Return the factors at the given indices, which may have any shape."""
         return Halves(self.U[rows], self.V[rows], self.s[rows])
 

@@ -95,7 +95,7 @@ def _stack(*coefficients: FloatArray) -> FloatArray:
 
 
 def _pad(polynomial: FloatArray, length: int) -> FloatArray:
-    padded: NDArray[np.float64] = np.zeros((*polynomial.shape[:-1], length))
+    padded: FloatArray = np.zeros((*polynomial.shape[:-1], length))
     padded[..., : polynomial.shape[-1]] = polynomial
     return padded
 

@@ -20,10 +20,7 @@ LEAST_RESIDUAL_PX = 1e-3
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Minimize (5.8), or `constraint_form`, from K_init with each pair weighted by 1 / its mean epipolar residual.
-
-    Without inliers the given weights stand in. Returns and raises as `verdict.calibrate_with`; the seed is unused.
-    """
+    """Minimize (5.8), or `constraint_form`, from K_init, each pair over its mean epipolar residual."""
     del seed
     weighted = replace(pairs, weights=residual_weights(pairs)) if pairs.inliers else pairs
     return calibrate_with(METHOD, weighted, partial(_find_camera, equations=EQUATIONS[options.constraint_form]))

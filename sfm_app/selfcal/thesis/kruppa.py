@@ -26,10 +26,7 @@ margin was chosen by hand."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Minimize the squared Kruppa equations of all pairs, from the median of their focal-only solutions.
-
-    Returns and raises as `verdict.calibrate_with`; options and seed are unused.
-    """
+    """Minimize the squared Kruppa equations of all pairs, from the median of their focal-only solutions."""
     del options, seed
     return calibrate_with(METHOD, pairs, _find_camera)
 

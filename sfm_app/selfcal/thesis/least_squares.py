@@ -8,14 +8,13 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.selfcal.pairs import Pairs
 from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations, Halves
 from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import FloatArray, IndexArray
 
 METHOD = "huang-faugeras"
 DEFAULT = EQUATIONS["huang-faugeras"]
@@ -61,7 +60,7 @@ def find_minima(halves: Halves, weights: FloatArray, starts: FloatArray, equatio
     """
     scale = np.sqrt(weights / np.sum(weights, axis=1, keepdims=True))[..., None]
 
-    def residuals(thetas: FloatArray, rows: NDArray[np.int64]) -> FloatArray:
+    def residuals(thetas: FloatArray, rows: IndexArray) -> FloatArray:
         values = scale[rows] * equations(halves[rows], _cameras(thetas)[:, None])
         return np.asarray(values.reshape(len(thetas), -1))
 
@@ -102,11 +101,7 @@ def _cameras(thetas: FloatArray) -> FloatArray:
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Minimize (5.8), or `constraint_form`, from K_init with equal weights.
-
-    The weights show which pairs take part (> 0), and count in the verdict only. Returns and raises as
-    `verdict.calibrate_with`; the seed is unused.
-    """
+    """Minimize (5.8), or `constraint_form`, from K_init with equal weights; the given ones select pairs."""
     del seed
     return calibrate_with(METHOD, pairs, partial(_find_camera, equations=EQUATIONS[options.constraint_form]))
 

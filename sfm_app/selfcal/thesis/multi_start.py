@@ -29,11 +29,7 @@ USUAL_FOCAL = (1.0, 0.5)
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Return the best of many least-squares solutions on three pairs each (thesis Algorithm 2).
-
-    The weights count in the distribution of the focal and in the verdict; the seed is that of the triples and the
-    starts. Returns and raises as `verdict.calibrate_with`.
-    """
+    """Return the best of many least-squares solutions on three pairs each (thesis Algorithm 2)."""
     find = partial(algorithm_2, seed=seed, equations=EQUATIONS[options.constraint_form])
     return calibrate_with(METHOD, pairs, find, SAMPLE)
 

@@ -21,11 +21,7 @@ TOLERANCE = 1e-6
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Minimize (5.8), or `constraint_form`, repeatedly, with weights from the error discrepancy (thesis Algorithm 3).
-
-    The weights show which pairs take part (> 0), and count in the verdict only. Returns and raises as
-    `verdict.calibrate_with`; the seed is unused.
-    """
+    """Minimize (5.8), or `constraint_form`, with weights from the error discrepancy (thesis Algorithm 3)."""
     del seed
     return calibrate_with(METHOD, pairs, partial(algorithm_3, equations=EQUATIONS[options.constraint_form]))
 
@@ -33,10 +29,7 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 def algorithm_3(
     pairs: Pairs, tall: float, evidence: dict[str, float], equations: Equations = DEFAULT
 ) -> CameraParameters:
-    """Estimate the camera from K_init by Algorithm 3 as the thesis writes it, in image widths.
-
-    Adds the number of iterations and the effective number of pairs to the evidence.
-    """
+    """Estimate the camera from K_init by Algorithm 3 as the thesis writes it, in image widths."""
     camera, weights = CameraParameters.initial(tall), np.ones(len(pairs))
     for iteration in range(1, MOST_ITERATIONS + 1):
         before, camera = camera, fit_camera(pairs, camera, weights, equations)

@@ -100,11 +100,7 @@ PEAK_RANGE, PEAK_SIGMA = (0.3, FOCAL_RANGE), 0.1
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Find K where the zero curves of all pairs meet (thesis Algorithm 4).
-
-    The thesis gives every pair the same weight: the weights show which pairs take part (> 0), and count in the verdict
-    only. Returns and raises as `verdict.calibrate_with`; the seed is unused.
-    """
+    """Find K where the zero curves of all pairs meet (thesis Algorithm 4); weights select pairs."""
     del seed
     return calibrate_with(METHOD, pairs, partial(algorithm_4, samples=options.samples))
 

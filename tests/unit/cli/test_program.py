@@ -158,8 +158,9 @@ def test_mistyped_commands_are_explained(folder, words, text):
     assert result.exit_code == 2 and text.format(folder=folder) in result.stderr
 
 
-def test_a_name_with_spaces_wants_quotes():
-    result = call("run", "My", "photos", "-o", "out")
+@pytest.mark.parametrize("command", ["run", "calibrate"])
+def test_a_name_with_spaces_wants_quotes(command):
+    result = call(command, "My", "photos", "-o", "out")
     assert result.exit_code == 3 and "My" in result.stderr and "quotes around a name with spaces" in result.stderr
 
 

@@ -34,7 +34,7 @@ def test_mapping_seeks_the_lens_only_where_nothing_is_known_about_it(tmp_path, m
         seen.append((options.ba_refine_extra_params, options.constant_cameras))
         return {0: start}
 
-    monkeypatch.setattr(mapping.pycolmap, "incremental_mapping", grow)
+    monkeypatch.setattr(pycolmap, "incremental_mapping", grow)
     place = tmp_path / "database.db", tmp_path, start, tmp_path / "scratch"
 
     for kept in ({2, 3}, ()):

@@ -35,7 +35,7 @@ def test_all_pairs_of_a_small_set_are_asked():
 
 
 def test_every_photo_of_a_large_set_is_asked_with_near_and_far_partners(monkeypatch):
-    monkeypatch.setattr(module, "OPTIONS", replace(module.OPTIONS, all_pairs=300))
+    monkeypatch.setattr(module.OPTIONS, "all_pairs", 300)
     views = row_of_photos(200, 20)
     found = sample_pairs(views, 200)
     counts = np.bincount(np.array(list(found.fits)).ravel(), minlength=200)
@@ -46,7 +46,7 @@ def test_every_photo_of_a_large_set_is_asked_with_near_and_far_partners(monkeypa
 
 
 def test_pairs_that_determine_no_matrix_are_not_asked(monkeypatch):
-    monkeypatch.setattr(module, "OPTIONS", replace(module.OPTIONS, all_pairs=300))
+    monkeypatch.setattr(module.OPTIONS, "all_pairs", 300)
     flat = {(a, a + 1) for a in range(199)}
     found = sample_pairs(row_of_photos(200, 20, degenerate=flat), 200)
     assert flat.isdisjoint(found.fits)

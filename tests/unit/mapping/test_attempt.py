@@ -336,7 +336,7 @@ def test_all_pairs_of_a_small_set_are_mapped():
 
 
 def test_some_pairs_of_each_photo_of_a_large_set_are_mapped(monkeypatch):
-    monkeypatch.setattr(module, "MAPPING", replace(module.MAPPING, fully_mapped_photos=90))
+    monkeypatch.setattr(module.MAPPING, "fully_mapped_photos", 90)
     graph = row_of_photos(100, 40)
     found = pairs_to_map(graph)
     counts = np.bincount(np.array(list(found.poses)).ravel(), minlength=100)

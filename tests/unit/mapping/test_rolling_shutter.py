@@ -106,7 +106,7 @@ def test_a_model_that_could_not_be_adjusted_is_not_asked(still):
 
 @pytest.mark.slow
 def test_too_many_frames_are_not_asked_and_the_reason_is_given(still, monkeypatch):
-    monkeypatch.setattr(rolling_shutter, "OPTIONS", replace(rolling_shutter.OPTIONS, max_frames=KIND.frames - 1))
+    monkeypatch.setattr(rolling_shutter.OPTIONS, "max_frames", KIND.frames - 1)
     said = Said()
     model, found = follow(still, said)
     assert model is still.adjusted and not said.texts
