@@ -157,7 +157,7 @@ def test_every_refusal_is_one_line_and_a_hint(folder, masks, tmp_path, case):
 
 # somebody in magenta stands before the scene, always in the middle of the photo; a date is printed into a corner
 
-QUICK = {"quality": "draft", "report": False, "depth": {"max_image_size_px": 240}, "mesh": {"poisson_depth": 7}}
+QUICK = {"quality": "draft", "report": False, "depth": {"max_image_size_px": 240}}
 PERSON, STAMP = np.s_[110:260, 200:270], np.s_[285:315, 340:470]
 
 

@@ -308,7 +308,7 @@ COMMANDS = {
     "a setting of the wrong type": ("{photos} -o {here}/out --set mesh.faces=many", 2, "mesh.faces"),
     "a setting out of range": ("{photos} -o {here}/out --seed -1", 2, "seed"),
     "a setting that is not finite":
-        ("{photos} -o {here}/out --set mesh.max_gap_triangles=nan", 2, "mesh.max_gap_triangles"),
+        ("{photos} -o {here}/out --set mesh.min_island=nan", 2, "mesh.min_island"),
     "a plug-in that is not loaded":
         ("{photos} -o {here}/out --no-plugins --estimator poselib-lo-ransac", 2, "no estimator is named"),
     "too little memory": ("{photos} -o {here}/out --max-memory 0.1", 2, "more than --max-memory"),

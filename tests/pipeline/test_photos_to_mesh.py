@@ -30,7 +30,7 @@ from sfm_app.synthetic.compare import center_error_percent, focal_error_percent,
 from sfm_app.texture import pages
 from sfm_app.types.scene import camera_center
 
-QUICK = {"quality": "draft", "report": False, "depth": {"max_image_size_px": 360}, "mesh": {"poisson_depth": 8}}
+QUICK = {"quality": "draft", "report": False, "depth": {"max_image_size_px": 360}}
 DRAFT = Settings.from_mapping(QUICK)
 SMALL = {"max_image_size_px": 360}
 SMALLER = "--set", "matching.max_image_size_px=360"

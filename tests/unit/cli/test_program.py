@@ -109,12 +109,12 @@ def test_a_script_for_each_shell_calls_the_program(monkeypatch, shell):
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
 def test_config_prints_toml_that_loads(tmp_path, encoding):
-    flags = ("--quality", "high", "--set", "mesh.max_gap_triangles=3", "--estimator", "msac", "--faces", "5000")
+    flags = ("--quality", "high", "--set", "mesh.min_island=0.25", "--estimator", "msac", "--faces", "5000")
     result = call("config", *flags)
     path = tmp_path / "run.toml"
     path.write_text(result.stdout, encoding=encoding)  # PowerShell writes UTF-16
     loaded = Settings.from_toml(path)
-    assert (loaded.quality, loaded.mesh.max_gap_triangles, loaded.epipolar.estimator) == ("high", 3.0, "msac")
+    assert (loaded.quality, loaded.mesh.min_island, loaded.epipolar.estimator) == ("high", 0.25, "msac")
     assert loaded.mesh.faces == 5000
     assert loaded.depth.max_image_size_px == Settings.from_mapping({"quality": "high"}).depth.max_image_size_px
 

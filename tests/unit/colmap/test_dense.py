@@ -24,7 +24,7 @@ from sfm_app.colmap.dense import (
     used_pixels,
     write_fusion_views,
 )
-from sfm_app.colmap.surface import FUSED, fuse, open_points, poisson_surface, positions, simplify
+from sfm_app.colmap.surface import FUSED, fuse, open_points, positions, simplify
 from sfm_app.errors import BackendError
 from sfm_app.photos.masks import save_mask
 from sfm_app.progress import Progress
@@ -158,22 +158,6 @@ def test_the_box_cuts_the_points(workspace):
     assert positions(open_points(dense / FUSED))[:, 0].min() >= 0
 
 
-def test_the_surface_has_the_shape_of_the_points_whatever_came_before(workspace):
-    dense, _ = workspace
-    fuse(dense, 3, BOX, dense / FUSED)
-
-    surface = poisson_surface(dense, 6)
-
-    inside = np.all(np.abs(surface.vertices[:, :2]) < 1, axis=1) & (np.abs(surface.vertices @ NORMAL - DISTANCE) < 0.3)
-    assert np.count_nonzero(inside) > 100
-    assert np.percentile(np.abs(surface.vertices[inside] @ NORMAL - DISTANCE), 90) < 0.02
-    assert surface.colors.shape == surface.vertices.shape and not (dense / "poisson.ply").exists()
-    poisson_surface(dense, 5)
-    again = poisson_surface(dense, 6)
-    np.testing.assert_array_equal(again.vertices, surface.vertices)
-    np.testing.assert_array_equal(again.faces, surface.faces)
-
-
 def wavy(size: int) -> Surface:
     """A square of two halves, flat on the left, wavy on the right, in the unit square."""
     y, x = np.mgrid[: size + 1, : size + 1] / size
@@ -208,15 +192,6 @@ def test_simplification_by_error_stops_where_it_would_move_the_surface(tmp_path,
     assert 0.7 * len(found.faces) // 2 < len(fewer.faces) <= len(found.faces) // 2
     np.testing.assert_array_equal(threaded.vertices, fewer.vertices)
     np.testing.assert_array_equal(threaded.faces, fewer.faces)
-
-
-def test_points_in_one_spot_give_a_surface_without_triangles(tmp_path):
-    header = "ply\nformat ascii 1.0\nelement vertex 120\n"
-    header += "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
-    header += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
-    (tmp_path / FUSED).write_text(header + "1 1 1 0 0 1 9 9 9\n" * 120)
-    surface = poisson_surface(tmp_path, 5)
-    assert (surface.vertices.shape, surface.faces.shape, surface.colors.shape) == ((0, 3), (0, 3), (0, 3))
 
 
 def test_missing_inputs_are_backend_errors(tmp_path, workspace):

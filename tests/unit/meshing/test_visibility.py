@@ -1,11 +1,11 @@
-"""What a depth map says about points, and the colors that it lends them."""
+"""What a depth map says about points."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from sfm_app.meshing.visibility import CONFIRMED, EMPTY, NO_EVIDENCE, SEEN_THROUGH, SKY, Paint, judge, sample_colors
+from sfm_app.meshing.visibility import CONFIRMED, EMPTY, NO_EVIDENCE, SEEN_THROUGH, SKY, judge
 from sfm_app.types import PosedPhoto
 
 FACING = np.array([[0.0, 0.0, -1.0]])
@@ -75,26 +75,3 @@ def test_what_stands_before_the_sky_is_seen_through_from_both_sides(eye):
         verdict = eye.judge(points, facing.repeat(4, axis=0))
 
         assert verdict.tolist() == [SEEN_THROUGH, SEEN_THROUGH, SEEN_THROUGH, beside]
-
-
-def test_colors_are_those_of_the_pixels_and_the_closer_photo_weighs_more(eye):
-    image = np.zeros((60, 80, 3), np.uint8)
-    image[..., 0] = np.arange(80) * 2
-    points = np.array([[0, 0, 10.0], [0.5, -1, 10.0], [3, 0, 10.0]])
-    normals = np.repeat(FACING, 3, axis=0)
-
-    paint = sample_colors(points, normals, eye.judge(points, normals), eye.photo, image)
-    near = Eye(eye.photo.resize(160, 120), np.full((120, 160), 10.0, np.float32))
-    white = np.full((120, 160, 3), 255, np.uint8)
-    closer = sample_colors(points, normals, near.judge(points, normals), near.photo, white)
-
-    np.testing.assert_allclose(paint.mean_colors(points)[:, 0], [79, 89, 89], atol=1)
-    np.testing.assert_allclose(closer.weight[:2], 4 * paint.weight[:2])
-    both = Paint.zeros(3)
-    both.add(np.arange(3), paint)
-    both.add(np.arange(3), closer)
-    np.testing.assert_allclose(both.mean_colors(points)[0, 0], (79 + 4 * 255) / 5, atol=1)
-
-
-def test_a_surface_that_no_photo_confirms_is_black():
-    assert Paint.zeros(2).mean_colors(np.eye(3)[:2]).tolist() == [[0, 0, 0], [0, 0, 0]]

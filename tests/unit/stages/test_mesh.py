@@ -148,7 +148,7 @@ def test_what_no_photo_sees_is_cut_off_or_kept_closed(dense, tmp_path):
     write_fusion_views(half, read_views(half))
 
     cut, _ = made(half)
-    closed, _ = made(half, trim=False)
+    closed, _ = made(half, watertight=True)
 
     assert -0.75 < cut.vertices[:, 2].min() < 0.2
     assert closed.vertices[:, 2].min() < cut.vertices[:, 2].min() - 0.1

@@ -134,19 +134,3 @@ def test_nothing_is_used_that_was_found_with_something_else(tmp_path, monkeypatc
 
     assert (found[1] is None) == bool(change)
     assert not (tmp_path / "texture" / texture.PARTS).exists()
-
-
-@pytest.mark.parametrize(
-    ("closed", "asked", "trimmed"), [(False, True, True), (False, False, False), (True, True, False)]
-)
-def test_borders_of_a_surface_that_shall_be_closed_are_not_cut(tmp_path, monkeypatch, closed, asked, trimmed):
-    found = []
-
-    def texture_surface(surface, views, store, hidden, options, spread):
-        found.append(options.trim_borders)
-        return Model(surface), {}
-
-    monkeypatch.setattr(texture, "texture_surface", texture_surface)
-    run = run_of(tmp_path, mesh={"trim": not closed}, texture={"trim_borders": asked})
-    texture.make(SimpleNamespace(cameras={}, camera_of={}, cam_from_world={}), SURFACE, run)
-    assert found == [trimmed]
