@@ -132,14 +132,19 @@ def test_one_photo_that_sees_through_a_hole_counts_less_than_two_that_see_nothin
 
 
 def test_points_that_more_photos_see_through_than_confirm_are_left_out(seen):
+    """One photo shows a leaf above the sheet, the three others do not."""
     sheet = Sheet(0.0, "nothing")
-    cloud, patch = sheet.cloud, np.array([[0.1, 0.1, 0.5], [0.12, 0.1, 0.5], [0.1, 0.13, 0.5]])
-    floating = Cloud(
-        np.concatenate([cloud.points, patch]), np.tile([0.0, 0.0, 1.0], (len(cloud.points) + 3, 1)),
-        np.concatenate([cloud.colors, np.zeros((3, 3), np.uint8)]), np.full(len(cloud.points) + 3, STEP),
-    )  # fmt: skip
+    places, _ = grid(*[np.linspace(-0.15, 0.15, 13)] * 2)
+    leaf, count = np.column_stack([places, np.full(len(places), 0.5)]), len(sheet.cloud.points) + len(places)
+    points, colors = np.concatenate([sheet.cloud.points, leaf]), np.zeros((count, 3), np.uint8)
+    cloud = Cloud(points, np.tile([0.0, 0.0, 1.0], (count, 1)), colors, np.full(count, STEP))
 
-    found, _ = seen(floating, ABOVE, sheet.depths)
+    def depths(view):
+        depth, at = plane_depths(view, 0.5)
+        is_leaf = (view is ABOVE[0]) & (np.abs(at).max(axis=-1) < 0.2)
+        return np.where(is_leaf, depth, sheet.depths(view)).astype(np.float32)
+
+    found, _ = seen(cloud, ABOVE, depths)
 
     assert np.abs(found.vertices[:, 2]).max() < STEP and total(found) == pytest.approx(4.0, rel=0.03)
 
