@@ -100,8 +100,8 @@ def _left(forest: Forest, parent: int, down: int) -> int:
     Flow runs down the source's tree, and up the sink's.
     """
     if forest.tree[parent] == SOURCE:
-        return forest.capacity[parent, down]
-    return forest.capacity[forest.neighbors[parent, down], forest.back[parent, down]]
+        return int(forest.capacity[parent, down])
+    return int(forest.capacity[forest.neighbors[parent, down], forest.back[parent, down]])
 
 
 @inlined_kernel

@@ -185,7 +185,7 @@ def _face_normal(points: FloatArray, corners: NDArray[np.int32], t: int, k: int,
     ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
     vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
     n[0], n[1], n[2] = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    return a
+    return int(a)
 
 
 @kernel
@@ -195,8 +195,8 @@ def _cast(
 ) -> None:  # fmt: skip
     """Add the lines of sight; `sigma` (N,) is the uncertainty of the points.
 
-    `crossed` (T, 4) has those from a tetrahedron to its neighbors, in the direction of sight, and `ends` (T,) those that
-    begin in it less those that end.
+    `crossed` (T, 4) has those from a tetrahedron to its neighbors, in the direction of sight, and `ends` (T,) those
+    that begin in it less those that end.
     """
     d, n = np.empty(3), np.empty(3)
     for line in range(len(sights.point)):
@@ -296,7 +296,10 @@ def _add_shape(cells: Cells, beta: float, crossed: NDArray[np.float32]) -> None:
 def _circumsphere(
     points: FloatArray, corners: NDArray[np.int32], t: int, center: FloatArray, radius: FloatArray
 ) -> None:
-    """Fill in the center and radius; of edges p, q, r it is (|p|^2 q x r + |q|^2 r x p + |r|^2 p x q) / (2 p . q x r)."""
+    """Fill in the center and radius.
+
+    From the corner of the edges p, q, r, the center is at (|p|^2 q x r + |q|^2 r x p + |r|^2 p x q) / (2 p . q x r).
+    """
     a, b, c, d = corners[t]
     px, py, pz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
     qx, qy, qz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
@@ -340,8 +343,8 @@ def _join_corners(
 ) -> int:  # fmt: skip
     """Fill in pairs of corners (3 f + i) of faces that are one vertex; return how many.
 
-    From each edge of a face, the way leads around the edge through full tetrahedra to the next face. `number` (T, 4) has
-    the number of each face; face f is opposite to corner `sides[f]` of `tetrahedra[f]`.
+    From each edge of a face, the way leads around the edge through full tetrahedra to the next face. `number` (T, 4)
+    has the number of each face; face f is opposite to corner `sides[f]` of `tetrahedra[f]`.
     """
     corners, neighbors, count = cells.corners, cells.neighbors, 0
     for f in range(len(tetrahedra)):

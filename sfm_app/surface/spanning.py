@@ -32,8 +32,6 @@ SMOOTHING = 3
 """Steps of smoothing: the cut passes through points with noise. Chosen by hand."""
 LEAST_CONFIRMED = 200
 """Points that a photo has to confirm to take part in the refinement of a block. Chosen by hand."""
-LEAST_SEEN = 0.1
-"""Least share of a patch over a hole that photos show: the underside of a table has none. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,11 +47,12 @@ class Evidence:
     def judge(self, points: FloatArray, normals: FloatArray) -> Iterable[NDArray[np.uint8]]:
         """Return the verdict of each photo on points (N, 3) with unit normals (N, 3)."""
 
-        def look(view: View) -> NDArray[np.uint8]:
+        def look(number: int) -> NDArray[np.uint8]:
+            view = self.views[number]
             depth = read_depth(self.dense_dir, view, "geometric")
             return judge(points, normals, view, depth, view.sample_px, self.tolerance)
 
-        return self.spread(look, self.views)
+        return self.spread(look, range(len(self.views)))
 
 
 def gather(records: NDArray[np.void], views: Sequence[View]) -> Cloud:
@@ -133,7 +132,7 @@ def drop_guesses(surface: Surface, step: FloatArray, evidence: Evidence) -> Surf
     count, patch = connected_components(graph, directed=False)
 
     def sum_up(values: NDArray[np.generic]) -> FloatArray:
-        return np.bincount(patch, values, count)
+        return np.asarray(np.bincount(patch, values.astype(np.float64), count), np.float64)
 
     uses, inner = np.bincount(edge_of.ravel(), minlength=len(edges)), np.bincount(sides.ravel(), minlength=len(edges))
     rim = sum_up((lengths[sides] * (inner[sides] == 1)).sum(axis=1))
