@@ -1,4 +1,4 @@
-"""COLMAP's fusion of depth maps, Poisson surface reconstruction from the fused points, and mesh simplification."""
+"""COLMAP's fusion of depth maps, and mesh simplification."""
 
 from collections.abc import Sequence
 from functools import partial

@@ -88,7 +88,7 @@ def undistort(
     check_written(*(path for path in dense_dir.rglob("*") if path.is_file()))
 
 
-# Fusion, Poisson meshing and simplification run on one thread: with more, the result depends on the order of the
+# Fusion and simplification run on one thread: with more, the result depends on the order of the
 # threads, and where cores are shared they are many times slower.
 
 
