@@ -41,6 +41,8 @@ FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 """Corners of the face opposite to each corner, counter-clockwise seen from outside."""
 
 
+JITTER = 1e-5
+"""Largest shift of a point for the tetrahedra, in distances of points. By definition: rounding is far below."""
 FAR = 3.0 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 """Corners of a tetrahedron around all points, in extents of these."""
 
@@ -124,13 +126,15 @@ class Cells(NamedTuple):
     """Tetrahedra around the points."""
 
 
-def cut_surface(cloud: Cloud, sights: Sights) -> tuple[Surface, FloatArray]:
-    """Return the cut as an oriented manifold, closed except far from all points, and (V,) the points' steps."""
+def cut_surface(cloud: Cloud, sights: Sights, *, close: bool = False) -> tuple[Surface, FloatArray]:
+    """Return the cut, oriented, and (V,) the points' steps; open where it leads beyond all points, unless `close`."""
     from scipy.spatial import Delaunay
 
     origin, scale = cloud.points.mean(axis=0), float(np.ptp(cloud.points, axis=0).max())
+    # flat tetrahedra have no outside: none is exactly flat
+    jitter = JITTER * np.random.default_rng(0).uniform(-1.0, 1.0, cloud.points.shape) * cloud.step[:, None]
     # tetrahedra behind every point, also on the convex hull
-    points = np.concatenate([(cloud.points - origin) / scale, FAR])
+    points = np.concatenate([(cloud.points + jitter - origin) / scale, FAR])
     raw = Delaunay(points)
     _orient(points, raw.simplices, raw.neighbors)
     cells = Cells(points, raw.simplices, raw.neighbors, *_find_around(raw.simplices, len(points)))
@@ -139,7 +143,10 @@ def cut_surface(cloud: Cloud, sights: Sights) -> tuple[Surface, FloatArray]:
     _cast(cells, sight, OPTIONS.sigma * cloud.step / scale, OPTIONS.behind, crossed, ends)
     _add_shape(cells, OPTIONS.beta, crossed)
     capacity = np.rint(np.minimum(UNIT * crossed, 2.0**30)).astype(np.int32)
-    full = sink_side(cells.neighbors, capacity, np.rint(UNIT * ends).astype(np.int64))
+    excess = np.rint(UNIT * ends).astype(np.int64)
+    if close:
+        excess[(cells.corners >= len(cloud.points)).any(axis=1)] += 2**40  # beyond all points is free
+    full = sink_side(cells.neighbors, capacity, excess)
     faces, vertices = _extract(cells, full)
     used, faces = number_vertices(faces[(vertices[faces] < len(cloud.points)).all(axis=1)])
     at = vertices[used]

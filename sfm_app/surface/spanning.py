@@ -11,6 +11,7 @@ from sfm_app.colmap.dense import read_depth
 from sfm_app.colmap.surface import positions
 from sfm_app.geometry.triangles import select_faces, unique_edges
 from sfm_app.jit import kernel
+from sfm_app.meshing.cleaning import make_manifold
 from sfm_app.meshing.tetrahedra import OPTIONS, Cloud, choose_sights, cut_surface, thin
 from sfm_app.meshing.visibility import CONFIRMED, EMPTY, SEEN_THROUGH, judge
 from sfm_app.stereo import View
@@ -109,8 +110,8 @@ def span(
     number, cloud = np.cumsum(kept) - 1, cloud.select(kept)
     centers = np.stack([view.center for view in evidence.views])
     sights = choose_sights([number[at[kept[at]]] for at in seen], centers, len(cloud.points))
-    surface, step = cut_surface(cloud, sights)
-    return smooth(surface if close else drop_guesses(surface, step, evidence)), witnesses
+    surface, step = cut_surface(cloud, sights, close=close)
+    return make_manifold(smooth(surface if close else drop_guesses(surface, step, evidence))), witnesses
 
 
 def drop_guesses(surface: Surface, step: FloatArray, evidence: Evidence) -> Surface:

@@ -175,7 +175,6 @@ def test_balls_a_step_apart_are_two_and_balls_that_touch_are_closed():
     assert not np.any(upper[apart.faces].any(axis=1) & ~upper[apart.faces].all(axis=1))
 
 
-@pytest.mark.xfail(strict=True, reason="tetrahedra of four points in a plane turn either way")
 def test_points_in_the_same_plane_tear_nothing():
     """Pairs of points that mirror each other are in a plane."""
     found = two_balls(STEP, np.diag([1.0, 1.0, -1.0]))

@@ -139,12 +139,7 @@ def test_fewer_faces_do_not_fuse_again_and_one_worker_gives_the_same_bytes(dense
         np.testing.assert_array_equal(getattr(read_surface(run_in(dense).workspace), name), getattr(again, name))
 
 
-AT_HULL = pytest.mark.xfail(
-    strict=True, reason="tetrahedra outside the hull of the points are full where no line passes"
-)
-
-
-@pytest.mark.parametrize("watertight", [False, pytest.param(True, marks=AT_HULL)])
+@pytest.mark.parametrize("watertight", [False, True])
 def test_what_no_photo_sees_is_open_or_closed_as_asked(dense, tmp_path, watertight):
     half = tmp_path / "dense"
     shutil.copytree(dense, half)

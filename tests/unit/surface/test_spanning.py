@@ -173,12 +173,7 @@ def ball_depths(view):
     return np.where(root > 0.0, (b - np.sqrt(root.clip(min=0.0))) / a, 0.0).astype(np.float32)
 
 
-AT_HULL = pytest.mark.xfail(
-    strict=True, reason="tetrahedra outside the hull of the points are full where no line passes"
-)
-
-
-@pytest.mark.parametrize("close", [False, pytest.param(True, marks=AT_HULL)])
+@pytest.mark.parametrize("close", [False, True])
 def test_what_no_photo_sees_is_open_or_closed_as_asked(seen, close):
     """Photos from above show the upper part of a ball."""
     step = 0.04
