@@ -32,8 +32,8 @@ class OPTIONS:
     """Memory of COLMAP's fusion with its points. Measured."""
     points_per_mp: int = 70_000
     """Fused points: 70 000 of a walk through a town, 58 000 of fountain-P11. Measured."""
-    block_mb_per_point: float = 1200 / 1e6
-    """Memory of Poisson's reconstruction and its surface per point of a block. Measured."""
+    block_mb_per_point: float = 1600 / 1e6
+    """Memory of the tetrahedra and their surface per fused point of a block. Measured."""
     depth_seconds_per_mp: float = 1.2
     """Core seconds of depth maps per neighbor. Measured."""
     refine_seconds_per_mp: float = 1.0
