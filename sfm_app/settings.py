@@ -208,7 +208,7 @@ class MeshSettings(Section):
     """The surface through the depth maps."""
 
     watertight: bool = Field(False, description="close the surface where no photo sees it, by a guess, for printing")
-    min_island: float = Field(0.003, ge=0, le=1, description="parts with a smaller share of the triangles are dropped")
+    min_island: float = Field(0.0003, ge=0, le=1, description="parts with a smaller share of the triangles are dropped")
     max_error_edges: float = Field(0.15, ge=0, le=10, description="most that simplification moves it, in edges")
     max_image_size_px: int = Field(
         1600,
