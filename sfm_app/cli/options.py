@@ -80,6 +80,7 @@ SETTING_FLAGS = (
     SettingFlag("--markers", "scale.markers", metavar="LENGTH"),
     SettingFlag("--gcp", "scale.control_points", metavar="FILE"),
     SettingFlag("--faces", "mesh.faces"),
+    SettingFlag("--watertight", "mesh.watertight"),
     SettingFlag("--unseen-faces", "texture.unseen_faces"),
 )
 

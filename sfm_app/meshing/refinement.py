@@ -1,7 +1,7 @@
 """Refinement of a surface by photos, from coarse to fine, in a few Gauss-Newton steps each."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from threading import Lock
@@ -13,7 +13,7 @@ from sfm_app.geometry.triangles import morton_order, unique_edges, vertex_normal
 from sfm_app.meshing.agreement import NOTHING, Pull, RefinePhoto, Sight, compare, project_vertices, rasterize
 from sfm_app.meshing.fairness import Neighbors, find_displacements
 from sfm_app.tasks import Spread
-from sfm_app.types import Surface
+from sfm_app.types import PosedPhoto, Surface
 from sfm_app.types.arrays import FloatArray, IndexArray
 
 MOST_KEPT_PX = 100_000_000
@@ -64,34 +64,33 @@ def refine(
     """
     correlations = list[float]()
     for share, iterations in OPTIONS.levels:
-        surface = _divide_surface(surface, photos, share, most)
+        posed = [photo.posed_at(share) for photo in photos]
+        surface = _divide_surface(surface, posed, most)
         neighbors = Neighbors.from_faces(surface.faces, len(surface.vertices))
-        reach = OPTIONS.longest_step_px * finest_pixels(surface.vertices, photos, share)
+        reach = OPTIONS.longest_step_px * finest_pixels(surface.vertices, posed)
         for _ in range(iterations):
             surface, correlation = _improve(surface, neighbors, reach, photos, partners, share, spread)
             correlations.append(correlation)
     return Refinement(surface, tuple(correlations))
 
 
-def _divide_surface(surface: Surface, photos: Sequence[RefinePhoto], share: float, most: int) -> Surface:
+def _divide_surface(surface: Surface, photos: Sequence[PosedPhoto], most: int) -> Surface:
     """Return the surface with triangles small enough for a level of the photos, as far as `most` allows."""
     for _ in range(OPTIONS.divisions):
-        finer = split_long_edges(surface, OPTIONS.edge_px * finest_pixels(surface.vertices, photos, share))
+        finer = split_long_edges(surface, OPTIONS.edge_px * finest_pixels(surface.vertices, photos))
         if len(finer.faces) == len(surface.faces) or len(finer.faces) > most:
             break
         surface = finer
     return sort_in_space(surface)
 
 
-def finest_pixels(vertices: FloatArray, photos: Sequence[RefinePhoto], share: float) -> FloatArray:
-    """Return (V,) the size of a pixel at each vertex in the closest photo with it in view, even hidden, or infinity."""
-    sizes = np.full(len(vertices), np.inf)
+def finest_pixels(points: FloatArray, photos: Iterable[PosedPhoto]) -> FloatArray:
+    """Return (N,) the size of a pixel at each point in the closest photo with it in view, even hidden, or infinity."""
+    sizes = np.full(len(points), np.inf)
     for photo in photos:
-        full, small = photo.posed, photo.posed_at(share)
-        x, y, near = project_vertices(vertices, small.projection).T
-        shown = (near > 0.0) & (x > 0.0) & (x < small.width) & (y > 0.0) & (y < small.height)
-        size = 1.0 / (near[shown] * full.focal_px * small.width / full.width)
-        sizes[shown] = np.minimum(sizes[shown], size)
+        x, y, near = project_vertices(points, photo.projection).T
+        shown = (near > 0.0) & (x > 0.0) & (x < photo.width) & (y > 0.0) & (y < photo.height)
+        sizes[shown] = np.minimum(sizes[shown], 1.0 / (near[shown] * photo.focal_px))
     return sizes
 
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from sfm_app.colmap.dense import read_depth
 from sfm_app.colmap.surface import positions
 from sfm_app.geometry.triangles import select_faces, unique_edges
-from sfm_app.jit import kernel
 from sfm_app.meshing.cleaning import make_manifold
+from sfm_app.meshing.refinement import finest_pixels
 from sfm_app.meshing.tetrahedra import OPTIONS, Cloud, choose_sights, cut_surface, thin
 from sfm_app.meshing.visibility import CONFIRMED, EMPTY, SEEN_THROUGH, judge
 from sfm_app.stereo import View
@@ -60,30 +60,13 @@ class Evidence:
 def gather(records: NDArray[np.void], views: Sequence[View]) -> Cloud:
     """Return the fused points (N,), from `open_points`, about as dense as the depth maps tell them apart."""
     points = positions(records)
-    pixel = np.full(len(points), np.inf)
-    for view in views:
-        _shrink_pixels(points, view.projection, np.array([view.width, view.height]), view.focal_px, pixel)
+    pixel = finest_pixels(points, views)
     near = np.isfinite(pixel)
     normals, colors = (
         np.stack([records[name][near] for name in names], axis=1)
         for names in (("nx", "ny", "nz"), ("red", "green", "blue"))
     )
     return thin(points[near], normals.astype(np.float64), colors, OPTIONS.spacing_px * pixel[near])
-
-
-@kernel
-def _shrink_pixels(
-    points: FloatArray, P: FloatArray, size: NDArray[np.int64], focal_px: float, pixel: FloatArray
-) -> None:
-    """Lower `pixel` (N,) to the side of a pixel at each point in view."""
-    for k in range(len(points)):
-        z = P[2, 0] * points[k, 0] + P[2, 1] * points[k, 1] + P[2, 2] * points[k, 2] + P[2, 3]
-        if z <= 0.0 or z / focal_px >= pixel[k]:
-            continue
-        x = P[0, 0] * points[k, 0] + P[0, 1] * points[k, 1] + P[0, 2] * points[k, 2] + P[0, 3]
-        y = P[1, 0] * points[k, 0] + P[1, 1] * points[k, 1] + P[1, 2] * points[k, 2] + P[1, 3]
-        if 0.0 <= x <= size[0] * z and 0.0 <= y <= size[1] * z:
-            pixel[k] = z / focal_px
 
 
 def span(

@@ -29,7 +29,8 @@ VALUES = {"seed": 3, "workers": 2, "cluster": "local:2",
           "cameras": "single", "max_frames": 50, "keep_low_quality": True, "features": "sift-dsp", "pairs": "all",
           "estimator": "msac", "calibrator": "kruppa", "calibration": "cameras.txt", "keep_calibration": True,
           "camera_model": "RADIAL", "mapper": "global", "scale": (("0,0,0", "1,0,0", "1.25m"),), "markers": "50mm",
-          "gcp": "gcp_list.txt", "positions": "geo.txt", "faces": 1000, "unseen_faces": "cut"}  # fmt: skip
+          "gcp": "gcp_list.txt", "positions": "geo.txt", "faces": 1000,
+          "watertight": True, "unseen_faces": "cut"}  # fmt: skip
 """A value other than the default for every flag."""
 every_flag = pytest.mark.parametrize("flag", SETTING_FLAGS, ids=lambda flag: flag.flag)
 

@@ -125,11 +125,12 @@ def test_a_pixel_is_as_large_as_the_distance_makes_it():
     scene = relief(flat)
     points = np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0]])
 
-    near, nowhere = finest_pixels(points, scene.photos, 1.0)
+    near, nowhere = finest_pixels(points, [photo.posed for photo in scene.photos])
 
     assert near == pytest.approx(1.9 / 320.0, rel=0.05) and np.isinf(nowhere)
-    assert finest_pixels(points, scene.photos, 0.5)[0] == pytest.approx(2 * near, rel=0.02)
-    half = scene.photos[0].posed_at(0.5)
+    halves = [photo.posed_at(0.5) for photo in scene.photos]
+    half = halves[0]
+    assert finest_pixels(points, halves)[0] == pytest.approx(2 * near, rel=0.02)
     assert (half.width, half.height) == (SIDE // 2, SIDE // 2)
 
 
