@@ -10,13 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel, summing_kernel
 from sfm_app.stereo.view import GrayImage, View
-from sfm_app.types.arrays import BoolArray, DepthArray, FloatArray
+from sfm_app.types.arrays import DepthArray, FloatArray
 
 PlaneArray = NDArray[np.float32]
 """(H, W, 3): inverse depth q and its slopes, q + qu du + qv dv at (du, dv) pixels away; q = 0 where unknown."""
@@ -44,7 +43,7 @@ MAX_STEP = 0.02
 
 @dataclass(frozen=True, slots=True)
 class PatchOptions:
-    """Weights in windows, and the gray levels of spill."""
+    """Weights in windows."""
 
     sigma_px: float = 4.0
     """Standard deviation of the weights in the correlation window."""
@@ -54,11 +53,6 @@ class PatchOptions:
     """Standard deviation of the weights of a plane fit; smaller keeps more detail, larger makes smoother normals."""
     min_weight: float = 0.25
     """Smallest share of the weight of a plane fit that must have a depth."""
-    sensor_noise_gray: float = 3.0
-    """Smallest standard deviation of gray levels: sensor noise and compression artifacts."""
-    min_odds: float = 8.0
-    """Smallest likelihood ratio of a pixel's gray, pixels without a depth over pixels with one, that removes its
-    depth."""
 
 
 OPTIONS = PatchOptions()
@@ -334,55 +328,3 @@ def _slopes(
         return 0.0, 0.0, 0.0
     gu, gv = (svv * qu - suv * qv) / det, (suu * qv - suv * qu) / det
     return (q - gu * su - gv * sv) / n, gu, gv
-
-
-REACH_PX = BORDER + 1
-"""A window centered this far from an outline still contains a pixel of it; on a textureless background that pixel
-alone decides."""
-SURROUNDINGS_PX = 4 * REACH_PX + 1
-"""Side of the square around a pixel that is compared with it: pixels with a depth, and pixels without one."""
-
-UNIFORM_LOG_LIKELIHOOD = 0.5 * np.log(2.0 * np.pi) - np.log(256.0)
-"""Log likelihood of a gray under the uniform distribution, for objects so thin that they consist of rim only."""
-
-
-def remove_spill(depth: DepthArray, image: GrayImage) -> DepthArray:
-    """Remove rim depths whose gray resembles the empty side rather than the surface that they extend.
-
-    Skies and plain backgrounds have no depth of their own, but a correlation window that reaches an object in front
-    of them finds the object's depth. The seam is half a window wide, and the same in every photo, so no check between
-    photos removes it. The gray levels decide. Around a pixel, pixels with a depth (away from the rim) and pixels
-    without one are each modeled as normally distributed. Beside gaps in a plain surface both distributions are the
-    same, and nothing is removed. Gaps narrower than two rims are ignored: they lie within surfaces.
-    """
-    known = depth > 0
-    empty, rim = _broad_areas(~known), rim_mask(known)
-    gray = image.astype(np.float32)
-    surface = _log_likelihood(gray, known & ~rim)
-    surface = np.where(np.isnan(surface), UNIFORM_LOG_LIKELIHOOD, surface)
-    spill = _log_likelihood(gray, empty) > surface + np.log(OPTIONS.min_odds)
-    return np.where(spill & rim, np.float32(0), depth)
-
-
-def rim_mask(known: BoolArray) -> BoolArray:
-    """Mark pixels with a depth within `REACH_PX` of a gap that is broader than two rims, (H, W)."""
-    away = cv2.distanceTransform(1 - _broad_areas(~known).view(np.uint8), cv2.DIST_L2, 3)
-    return np.asarray(known & (away <= REACH_PX))
-
-
-def _broad_areas(empty: BoolArray) -> BoolArray:
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * REACH_PX + 1, 2 * REACH_PX + 1))
-    return np.asarray(cv2.morphologyEx(empty.view(np.uint8), cv2.MORPH_OPEN, disc)).view(np.bool_)
-
-
-def _log_likelihood(gray: NDArray[np.float32], among: BoolArray) -> NDArray[np.float32]:
-    """Return (H, W) log likelihood of each pixel's gray given the marked pixels around it; NaN if fewer than 5."""
-    side = (SURROUNDINGS_PX, SURROUNDINGS_PX)
-    marked = among.astype(np.float32)
-    count = cv2.blur(marked, side)
-    share = np.where(count * SURROUNDINGS_PX**2 > 4.5, count, np.float32(np.nan))
-    mean = cv2.blur(gray * marked, side) / share
-    variance = (
-        np.maximum(cv2.blur(gray * gray * marked, side) / share - mean * mean, 0.0) + OPTIONS.sensor_noise_gray**2
-    )
-    return np.asarray(-0.5 * ((gray - mean) ** 2 / variance + np.log(variance)), np.float32)
