@@ -80,7 +80,7 @@ def rasterize(vertices: FloatArray, faces: IndexArray, photo: PosedPhoto) -> Ras
     """Draw a surface, its triangles counterclockwise from outside, into a photo at pixel centers."""
     size = photo.height, photo.width
     nearness, face = np.zeros(size, np.float32), np.full(size, NOTHING, np.int32)
-    _draw(project_vertices(vertices, photo.projection), faces, nearness, face)
+    draw(project_vertices(vertices, photo.projection), faces, nearness, face)
     with np.errstate(divide="ignore"):
         return Raster(np.float32(1.0) / nearness, face)
 
@@ -95,8 +95,8 @@ def project_vertices(vertices: FloatArray, projection: FloatArray) -> FloatArray
 
 
 @kernel
-def _draw(pixels: FloatArray, faces: IndexArray, nearness: NDArray[np.float32], face: NDArray[np.int32]) -> None:
-    """Fill in 1 / depth, which is linear in the photo, and the triangles; `pixels` from `project_vertices`."""
+def draw(pixels: FloatArray, faces: IndexArray, nearness: NDArray[np.float32], face: NDArray[np.int32]) -> None:
+    """Fill in 1 / depth, which is linear in the photo, and the triangles; `pixels` (V, 3) as `project_vertices`."""
     height, width = face.shape
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]

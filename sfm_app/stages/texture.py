@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.files import fingerprint, load_arrays, mark_unfinished, replace_atomically, resume_or_clear
-from sfm_app.meshing.ray_casting import NearestNormals, Occluders
+from sfm_app.meshing.ray_casting import NearestNormals
 from sfm_app.photos.decode import fill_masked
 from sfm_app.photos.masks import read_mask
 from sfm_app.photos.panoramas import mask_part, panorama_parts, show_part
@@ -33,10 +33,9 @@ def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
     made_from = fingerprint(run.fingerprint, cameras, surface_digest(surface))
     if not resume_or_clear(parts, made_from):
         mark_unfinished(parts, made_from)
-    is_hidden = Occluders(surface.vertices, surface.faces).is_hidden
     store = FileStore(run.workspace.photos, parts, run.mask_dir)
     options = run.settings.texture
-    model, figures = texture_surface(surface, views, store, is_hidden, options, run.map)
+    model, figures = texture_surface(surface, views, store, options, run.map)
     run.record(**figures)
     model = _add_normal_map(model, run) if run.settings.texture.normal_map else model
     write_texture(model, run.workspace)

@@ -5,6 +5,7 @@ A plain background has no texture of its own, so no check between photos removes
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.stereo.patch_match import BORDER
@@ -39,30 +40,32 @@ def settle_outlines(depth: DepthArray, image: GrayImage) -> DepthArray:
     empty = cv2.morphologyEx((depth <= 0).view(np.uint8), cv2.MORPH_OPEN, disc).view(np.bool_)
     farthest = cv2.dilate(np.where(empty, np.float32(np.inf), depth), disc)
     rim = (depth > 0) & (farthest > (1.0 + BEHIND) * depth)
-    settled = depth.copy()
-    _settle(depth, empty, rim, image, settled)
+    settled, nearness = depth.copy(), np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
+    _settle(nearness, empty, rim, image, settled)
     return settled
 
 
 @kernel
-def _settle(depth: DepthArray, empty: BoolArray, rim: BoolArray, image: GrayImage, settled: DepthArray) -> None:
-    height, width = depth.shape
+def _settle(nearness: DepthArray, empty: BoolArray, rim: BoolArray, image: GrayImage, settled: DepthArray) -> None:
+    """Settle the pixels of the rim, by 1 / depth: on a plane it is linear."""
+    height, width = nearness.shape
     sums = np.empty((2, 3))  # number, sum and sum of squares of grays behind, and of the object's
     for row in range(height):
         for col in range(width):
             if not rim[row, col]:
                 continue
-            z = depth[row, col]
+            near, across, down = nearness[row, col], slope(nearness, row, col, 0, 1), slope(nearness, row, col, 1, 0)
             sums[:] = 0.0
             nearest, behind = np.inf, np.float32(0)
             for i in range(max(row - AROUND_PX, 0), min(row + AROUND_PX + 1, height)):
                 for j in range(max(col - AROUND_PX, 0), min(col + AROUND_PX + 1, width)):
-                    is_behind = empty[i, j] or depth[i, j] > (1.0 + BEHIND) * z
-                    if not is_behind and (rim[i, j] or depth[i, j] < (1.0 - BEHIND) * z):
+                    ahead = nearness[i, j] - (near + across * (j - col) + down * (i - row))
+                    is_behind = empty[i, j] or (nearness[i, j] > 0 and ahead < -BEHIND * near)
+                    if not is_behind and (nearness[i, j] == 0 or rim[i, j] or ahead > BEHIND * near):
                         continue
                     gray, distance = float(image[i, j]), (i - row) ** 2 + (j - col) ** 2
                     if is_behind and distance < nearest:
-                        nearest, behind = distance, depth[i, j]
+                        nearest, behind = distance, nearness[i, j]
                     kind = 0 if is_behind else 1
                     sums[kind, 0] += 1.0
                     sums[kind, 1] += gray
@@ -70,13 +73,25 @@ def _settle(depth: DepthArray, empty: BoolArray, rim: BoolArray, image: GrayImag
             if sums[0, 0] < LEAST_PIXELS:
                 continue
             own = float(image[row, col])
-            object_likelihood = UNIFORM_LOG_LIKELIHOOD if sums[1, 0] < LEAST_PIXELS else _log_likelihood(own, sums[1])
-            if _log_likelihood(own, sums[0]) > object_likelihood + np.log(LEAST_ODDS):
-                settled[row, col] = behind
+            object_likelihood = UNIFORM_LOG_LIKELIHOOD if sums[1, 0] < LEAST_PIXELS else log_likelihood(own, sums[1])
+            if log_likelihood(own, sums[0]) > object_likelihood + np.log(LEAST_ODDS):
+                settled[row, col] = 1.0 / behind if behind > 0.0 else 0.0
 
 
 @kernel
-def _log_likelihood(gray: float, sums: FloatArray) -> float:
+def slope(values: NDArray[np.float32], row: int, col: int, down: int, across: int) -> float:
+    """Return the change of values from a pixel to the next in a direction: the smaller of both sides', not a jump."""
+    height, width = values.shape
+    i, j, k, m = row + down, col + across, row - down, col - across
+    ahead = values[i, j] - values[row, col] if i < height and j < width else np.inf
+    before = values[row, col] - values[k, m] if k >= 0 and m >= 0 else np.inf
+    least = ahead if abs(ahead) < abs(before) else before
+    return float(least) if np.isfinite(least) else 0.0
+
+
+@kernel
+def log_likelihood(gray: float, sums: FloatArray) -> float:
+    """Return that of a gray, normally distributed as others of a number, sum and sum of squares (3,)."""
     mean = sums[1] / sums[0]
     variance = max(sums[2] / sums[0] - mean * mean, 0.0) + NOISE_GRAY**2
     return float(-0.5 * ((gray - mean) ** 2 / variance + np.log(variance)))

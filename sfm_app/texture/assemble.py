@@ -30,7 +30,6 @@ from sfm_app.texture.sightings import (
     Facets,
     FaceView,
     IntArray,
-    OcclusionTest,
     facets,
     list_sightings,
     score_faces,
@@ -43,12 +42,7 @@ from sfm_app.types.arrays import BoolArray, IndexArray
 
 
 def texture_surface(
-    surface: Surface,
-    views: Sequence[PhotoView],
-    store: Store,
-    hidden: OcclusionTest,
-    options: TextureSettings,
-    spread: ParallelMap,
+    surface: Surface, views: Sequence[PhotoView], store: Store, options: TextureSettings, spread: ParallelMap
 ) -> tuple[Model, dict[str, Any]]:
     """Paint a surface, in the frame of the views, with photos.
 
@@ -57,9 +51,7 @@ def texture_surface(
     """
     mesh = facets(surface)
 
-    face_views = spread(
-        partial(_score_photo, views, store, mesh, hidden), range(len(views)), "finding visible triangles"
-    )
+    face_views = spread(partial(_score_photo, views, store, mesh), range(len(views)), "finding visible triangles")
     checked = _check_views(face_views, mesh)
     chosen = absorb_small_charts(choose_photos(checked.sightings, mesh), checked.sightings, mesh.neighbors)
     unseen = chosen == NONE
@@ -85,9 +77,7 @@ def texture_surface(
     }
 
 
-def _score_photo(
-    views: Sequence[PhotoView], store: Store, mesh: Facets, hidden: OcclusionTest, photo: int
-) -> FaceView | Rejected:
+def _score_photo(views: Sequence[PhotoView], store: Store, mesh: Facets, photo: int) -> FaceView | Rejected:
     name, view = f"view{photo}", views[photo]
     kept = store.recall(name)
     if kept is not None and "face" in kept:
@@ -96,7 +86,7 @@ def _score_photo(
         picture, used = store.photo(view), store.usable_pixels(view)
     except OSError as err:
         return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
-    face_view = score_faces(view, picture, used, mesh, hidden)
+    face_view = score_faces(view, picture, used, mesh)
     face, sharpness = face_view.face, np.array(face_view.sharpness)
     store.keep(name, {"face": face, "score": face_view.score, "color": face_view.color, "sharpness": sharpness})
     return face_view

@@ -8,12 +8,14 @@ from functools import partial
 from threading import Lock
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.tasks import ParallelMap, Spread
 from sfm_app.texture.charts import MARGIN, Charts, Layout
+from sfm_app.texture.outlines import draw_sight
 from sfm_app.texture.seams import Blend
 from sfm_app.texture.sightings import NONE, Facets, IntArray, Sightings
 from sfm_app.texture.views import PhotoView, project, sample
@@ -414,9 +416,12 @@ def _paint_photo(
     beside = plan.mesh.neighbors[triangles]
     open_edges = (beside == NONE) | (plan.checked.sightings.find(photo, beside) == NONE)
     view, scale = views[photo], plan.layout.scale
+    near = plan.mesh.faces[plan.mesh.clusters.find_in_cone(view.center, view.axis, view.widest_angle)]
+    pixels = draw_sight(view, store.photo(view), store.usable_pixels(view), plan.mesh.vertices, near).photo
     if scale < 1.0:
         view = view.resize(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
-    pixels, points = store.photo(view), plan.mesh.vertices[plan.mesh.faces[triangles]]
+        pixels = np.asarray(cv2.resize(pixels, (view.width, view.height), interpolation=cv2.INTER_AREA), np.uint8)
+    points = plan.mesh.vertices[plan.mesh.faces[triangles]]
     with pages.lock_canvases(photo) as canvases:
         for number, page in zip(numbers, canvases, strict=True):
             own = plan.page[triangles] == number

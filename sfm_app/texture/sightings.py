@@ -1,15 +1,16 @@
 """Triangles of a surface with their neighbors, and sightings: the triangles in each photo, with score and color."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.triangles import Clusters, bucket_order, cluster, number_vertices, unique_edges
+from sfm_app.geometry.triangles import Clusters, bucket_order, cluster, unique_edges
 from sfm_app.jit import kernel
+from sfm_app.texture.outlines import draw_sight, is_hidden
 from sfm_app.texture.views import POSE, PhotoView, project, sample
 from sfm_app.types import Surface
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
@@ -110,13 +111,12 @@ def components(group: IndexArray, neighbors: IntArray) -> tuple[IntArray, int]:
     return of, len(parts)
 
 
-OcclusionTest = Callable[[FloatArray, float, FloatArray], BoolArray]
-"""Takes a camera center (3,), the slack at a point, and points (N, 3); returns whether each is hidden, (N,)."""
-
 MIN_COSINE = 0.1
 """Smallest cosine of the viewing angle; from more oblique views, few pixels would be stretched over the triangle."""
 BORDER_PX = 2.0
 """Width of the unused border of a photo, where resampling and demosaicing are incomplete."""
+OUTLINE_FACTOR = 0.25
+"""Factor on the score of triangles beside outlines, where a photo may show the foreground or the background."""
 MASK_MARGIN_PX = 1.0
 """A triangle this close to a masked pixel is not used, because colors are interpolated between pixels."""
 
@@ -127,11 +127,6 @@ class SightingOptions:
 
     slack: float = 1.0
     """Slack of the occlusion test, in median edge lengths, so that the surface's roughness hides nothing."""
-    hidden_rings: int = 2
-    """Rings of triangles around hidden ones with a lower score: where the surface is off by a pixel, they show the
-    foreground or background."""
-    ring_factor: float = 0.5
-    """Factor on their score per ring."""
     sharpness_range: tuple[float, float] = (0.2, 1.0)
     """Smallest and largest factor on the scores of a photo."""
 
@@ -153,48 +148,20 @@ class FaceView:
     """Energy of the finest detail relative to that at half size; decreases with blur, hardly depends on content."""
 
 
-def score_faces(
-    view: PhotoView, photo: NDArray[np.uint8], used: BoolArray | None, mesh: Facets, hidden: OcclusionTest
-) -> FaceView:
+def score_faces(view: PhotoView, photo: NDArray[np.uint8], used: BoolArray | None, mesh: Facets) -> FaceView:
     """Score the triangles in a photo (height, width, 3) of the view's size; `used` masks its usable pixels."""
     near = mesh.clusters.find_in_cone(view.center, view.axis, view.widest_angle)
+    faces = mesh.faces[near]
+    sight = draw_sight(view, photo, used, mesh.vertices, faces)
     score, color = np.zeros(len(near), np.float32), np.zeros((len(near), 3), np.uint8)
-    _measure(view.row, photo, mesh.vertices, mesh.faces[near], score, color)
+    seen = sight.photo, sight.nearness, sight.foreign
+    _measure(view.row, seen, mesh.vertices, faces, OPTIONS.slack * mesh.spacing, score, color)
     if used is not None:
         masked = np.zeros((view.height + 1, view.width + 1), np.int32)
         np.cumsum(np.cumsum(~used, axis=0, dtype=np.int32), axis=1, out=masked[1:, 1:])
-        _drop_masked(view.row, masked, mesh.vertices, mesh.faces[near], score)
-    candidates = np.flatnonzero(score)
-    occluded = _occluded_mask(near[candidates], mesh, partial(hidden, view.center, OPTIONS.slack * mesh.spacing))
-    visible = candidates[~occluded]
-    face, score = near[visible], score[visible]
-    _lower_near_hidden(face, score, mesh)
+        _drop_masked(view.row, masked, mesh.vertices, faces, score)
     usable = score > 0
-    return FaceView(face[usable].astype(np.int32), score[usable], color[visible[usable]], sharpness(photo, used))
-
-
-def _lower_near_hidden(face: IndexArray, score: NDArray[np.float32], mesh: Facets) -> None:
-    """Lower the scores of visible triangles, in place, ring by ring from the hidden ones."""
-    inner = np.arange(len(face))
-    for _ in range(OPTIONS.hidden_rings):
-        corners = mesh.faces[face[inner]]
-        vertices, at = number_vertices(corners)
-        whole = np.bincount(at.ravel(), minlength=len(vertices)) == mesh.valence[vertices]
-        inside = whole[at].all(axis=1)
-        beyond = np.ones(len(face), np.bool_)
-        beyond[inner[inside]] = False
-        score[beyond] *= OPTIONS.ring_factor
-        inner = inner[inside]
-
-
-def _occluded_mask(candidates: IndexArray, mesh: Facets, hidden: Callable[[FloatArray], BoolArray]) -> BoolArray:
-    """Mark triangles hidden at the center or at two corners, (N,)."""
-    corners = mesh.faces[candidates]
-    points, at = number_vertices(corners)
-    blocked = hidden(mesh.vertices[points])[at].sum(axis=1, dtype=np.int8) > 1
-    rest = np.flatnonzero(~blocked)
-    blocked[rest] = hidden(mesh.vertices[corners[rest]].mean(axis=1))
-    return np.asarray(blocked, np.bool_)
+    return FaceView(near[usable].astype(np.int32), score[usable], color[usable], sharpness(photo, used))
 
 
 def sharpness(photo: NDArray[np.uint8], used: BoolArray | None = None) -> float:
@@ -210,7 +177,8 @@ def _energy(gray: NDArray[np.uint8], used: BoolArray | None) -> float:
     if used is None:
         return float(np.mean(energy))
     size = gray.shape[1], gray.shape[0]
-    counted = energy[cv2.resize(used.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0]
+    whole = (cv2.resize(used.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999).astype(np.uint8)
+    counted = energy[cv2.erode(whole, np.ones((3, 3), np.uint8)) > 0]  # the Laplacian reads the pixels around
     return float(np.mean(counted)) if counted.size else 0.0
 
 
@@ -224,13 +192,18 @@ def sharpness_factors(sharpness: FloatArray) -> FloatArray:
 @kernel
 def _measure(
     camera: FloatArray,
-    photo: NDArray[np.uint8],
+    seen: Any,
     vertices: FloatArray,
     faces: IndexArray,
+    slack: float,
     score: NDArray[np.float32],
     color: NDArray[np.uint8],
 ) -> None:
-    """Write area in pixels times cosine, and mean color, of triangles within the photo that face the camera."""
+    """Write area in pixels times cosine, and mean color, of triangles within the photo that face the camera.
+
+    `seen` is a `Sight`. Triangles hidden at the center or at two corners are left out.
+    """
+    photo, nearness, foreign = seen
     height, width = photo.shape[0], photo.shape[1]
     x, y, corner = np.empty(4), np.empty(4), np.empty((4, 3))
     for f in range(len(faces)):
@@ -239,19 +212,24 @@ def _measure(
             for k in range(3):
                 corner[k, axis] = vertices[faces[f, k], axis]
                 corner[3, axis] += corner[k, axis] / 3.0
-        inside = True
+        inside, hidden, beside = True, 0, False
         for k in range(4):
             x[k], y[k], depth = project(camera, corner[k, 0], corner[k, 1], corner[k, 2])
             inside = inside and depth > 0.0 and BORDER_PX <= x[k] <= width - BORDER_PX
             inside = inside and BORDER_PX <= y[k] <= height - BORDER_PX
-        if not inside:
+            if not inside:
+                break
+            beside = beside or foreign[int(y[k]), int(x[k])]
+            if is_hidden(nearness, x[k], y[k], depth, slack):
+                hidden += 2 if k == 3 else 1
+        if not inside or hidden > 1:
             continue
         cosine = _cosine(camera, corner)
         # y points down in the photo: triangles counterclockwise from outside have a negative area
         area = -0.5 * ((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]))
         if cosine < MIN_COSINE or area <= 0.0:
             continue
-        score[f] = area * cosine
+        score[f] = area * cosine * (OUTLINE_FACTOR if beside else 1.0)
         for channel in range(3):
             total = 0.0
             for k in range(4):

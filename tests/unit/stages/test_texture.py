@@ -114,7 +114,7 @@ def test_nothing_is_used_that_was_found_with_something_else(tmp_path, monkeypatc
     """The first run is killed at its second photo; photos that it has looked at are not read again."""
     found = []
 
-    def texture_surface(surface, views, store, hidden, options, spread):
+    def texture_surface(surface, views, store, options, spread):
         found.append(store.recall("view0"))
         if len(found) == 1:
             store.keep("view0", {"score": np.arange(3)})

@@ -6,7 +6,6 @@ from functools import cache
 import numpy as np
 
 from sfm_app.camera.models import camera_matrix
-from sfm_app.meshing.ray_casting import Occluders
 from sfm_app.settings import TextureSettings
 from sfm_app.texture.assemble import texture_surface
 from sfm_app.texture.sightings import facets, make_sightings
@@ -121,8 +120,7 @@ def one_by_one(function, items, label):
 
 def textured(album, surface, views, spread=one_by_one, **options):
     """The textured model of a surface, and its figures."""
-    hidden = Occluders(surface.vertices, surface.faces).is_hidden
-    return texture_surface(surface, views, album, hidden, TextureSettings(**options), spread)
+    return texture_surface(surface, views, album, TextureSettings(**options), spread)
 
 
 def assert_same_texture(one, other):
