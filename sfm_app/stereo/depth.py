@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.stereo.outlines import settle_outlines
+from sfm_app.stereo.outlines import remove_spill
 from sfm_app.stereo.patch_match import NO_MATCH, fit_planes, improve_planes, plane_normals
 from sfm_app.stereo.plain_areas import enclosed_pixels, fill_planar_areas, plain_walls, surfaceless_areas
 from sfm_app.stereo.rectify import depths_from_disparities, disparities, rectify
@@ -77,7 +77,7 @@ def match_depths(
     # at the view's position inside the pixel
     inverse = planes[..., 0] + np.float32(view.sample_px - 0.5) * (planes[..., 1] + planes[..., 2])
     known = (planes[..., 0] > 0) & (inverse > 0) & (cost < NO_MATCH)
-    depth = settle_outlines(np.divide(1, inverse, out=np.zeros_like(inverse), where=known), image)
+    depth = remove_spill(np.divide(1, inverse, out=np.zeros_like(inverse), where=known), image)
     return DepthEstimate(depth, np.where(depth > 0, np.maximum(1 - cost, 0), np.float32(0)))
 
 
@@ -177,7 +177,7 @@ def confirm_depths(
     min_agreeing: int,
     tolerance: float,
 ) -> DepthMap | Rejected:
-    """Keep depths that enough other maps confirm; settle outlines, remove specks, fill plain walls, add normals.
+    """Keep depths that enough other maps confirm; remove spill and specks, fill plain walls, add normals.
 
     The required number is `min_agreeing` >= 1; one more at low correlation; three more at very
     low correlation. There, a depth must also belong to a plain wall or lie between surer depths. Depths in skies are
@@ -196,7 +196,7 @@ def confirm_depths(
     walls = plain_walls(weak, sound)
     sound &= ~weak | walls | enclosed_pixels(sound & ~weak)
     confirmed = np.where(sound & ~surfaceless_areas(confidence, sound), estimate.depth, np.float32(0))
-    confirmed = filter_speckles(settle_outlines(confirmed, image), tolerance)
+    confirmed = filter_speckles(remove_spill(confirmed, image), tolerance)
     planes = fit_planes(fill_planar_areas(confirmed, image, tolerance, walls))
     if not planes.any():
         return Rejected("no depth is confirmed by other photos")

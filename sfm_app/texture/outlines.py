@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.meshing.agreement import draw
-from sfm_app.stereo.outlines import LEAST_ODDS, LEAST_PIXELS, UNIFORM_LOG_LIKELIHOOD, log_likelihood, slope
+from sfm_app.stereo.outlines import is_like, slope
 from sfm_app.texture.views import PhotoView, project
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
@@ -111,9 +111,7 @@ def _mark_foreign(
                     sums[kind, 0] += 1.0
                     sums[kind, 1] += value
                     sums[kind, 2] += value * value
-            if sums[1, 0] >= LEAST_PIXELS:
-                own = UNIFORM_LOG_LIKELIHOOD if sums[0, 0] < LEAST_PIXELS else log_likelihood(gray[y, x], sums[0])
-                foreign[y, x] = log_likelihood(gray[y, x], sums[1]) > own + np.log(LEAST_ODDS)
+            foreign[y, x] = is_like(float(gray[y, x]), sums[1], sums[0])
 
 
 @kernel
