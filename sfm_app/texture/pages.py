@@ -8,14 +8,12 @@ from functools import partial
 from threading import Lock
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.tasks import ParallelMap, Spread
 from sfm_app.texture.charts import MARGIN, Charts, Layout
-from sfm_app.texture.outlines import draw_sight
 from sfm_app.texture.seams import Blend
 from sfm_app.texture.sightings import NONE, Facets, IntArray, Sightings
 from sfm_app.texture.views import PhotoView, project, sample
@@ -201,14 +199,14 @@ def _add(
 def _set_insets(corner: FloatArray, is_open: BoolArray, double_area: float, least: FloatArray) -> None:
     """Set lower bounds of barycentric coordinates that keep texels away from open edges; other edges have none.
 
-    At an open edge, pixels mix with the background. Texels closer to it than 1.5 texels, or 0.3 of the triangle's
-    height, repeat the color at that distance.
+    At an open edge, pixels mix with the background. Texels closer to it than half the diagonal of a pixel, or 0.3 of
+    the triangle's height, repeat the color at that distance.
     """
     for k in range(3):
         a, b = (k + 1) % 3, (k + 2) % 3
         length = np.hypot(corner[b, 0] - corner[a, 0], corner[b, 1] - corner[a, 1])
         height_px = max(double_area / max(length, 1e-9), 1e-9)
-        least[k] = min(1.5 / height_px, 0.3) if is_open[a] else -9.0
+        least[k] = min(0.7 / height_px, 0.3) if is_open[a] else -9.0
 
 
 @kernel
@@ -416,12 +414,9 @@ def _paint_photo(
     beside = plan.mesh.neighbors[triangles]
     open_edges = (beside == NONE) | (plan.checked.sightings.find(photo, beside) == NONE)
     view, scale = views[photo], plan.layout.scale
-    near = plan.mesh.faces[plan.mesh.clusters.find_in_cone(view.center, view.axis, view.widest_angle)]
-    pixels = draw_sight(view, store.photo(view), store.usable_pixels(view), plan.mesh.vertices, near).photo
     if scale < 1.0:
         view = view.resize(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
-        pixels = np.asarray(cv2.resize(pixels, (view.width, view.height), interpolation=cv2.INTER_AREA), np.uint8)
-    points = plan.mesh.vertices[plan.mesh.faces[triangles]]
+    pixels, points = store.photo(view), plan.mesh.vertices[plan.mesh.faces[triangles]]
     with pages.lock_canvases(photo) as canvases:
         for number, page in zip(numbers, canvases, strict=True):
             own = plan.page[triangles] == number

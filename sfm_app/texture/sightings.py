@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.triangles import Clusters, bucket_order, cluster, unique_edges
 from sfm_app.jit import kernel
-from sfm_app.texture.outlines import draw_sight, is_hidden
+from sfm_app.meshing.agreement import draw
 from sfm_app.texture.views import POSE, PhotoView, project, sample
 from sfm_app.types import Surface
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
@@ -115,8 +115,12 @@ MIN_COSINE = 0.1
 """Smallest cosine of the viewing angle; from more oblique views, few pixels would be stretched over the triangle."""
 BORDER_PX = 2.0
 """Width of the unused border of a photo, where resampling and demosaicing are incomplete."""
-OUTLINE_FACTOR = 0.25
-"""Factor on the score of triangles beside outlines, where a photo may show the foreground or the background."""
+JUMP = 0.01
+"""Relative depth difference of adjacent pixels at an outline. Chosen by hand: a plane has it where it is seen at 2
+degrees in a photo of 3 000 pixels."""
+RIM, RIM_FACTOR = 0.002, 0.25
+"""Distance from an outline, in longer sides of the photo: two pixels of a depth map; and the factor on the score of
+triangles within it: where the surface is off, the photo shows the foreground or background."""
 MASK_MARGIN_PX = 1.0
 """A triangle this close to a masked pixel is not used, because colors are interpolated between pixels."""
 
@@ -152,9 +156,10 @@ def score_faces(view: PhotoView, photo: NDArray[np.uint8], used: BoolArray | Non
     """Score the triangles in a photo (height, width, 3) of the view's size; `used` masks its usable pixels."""
     near = mesh.clusters.find_in_cone(view.center, view.axis, view.widest_angle)
     faces = mesh.faces[near]
-    sight = draw_sight(view, photo, used, mesh.vertices, faces)
+    nearness = draw_nearness(view, mesh.vertices, faces)
+    away = cv2.distanceTransform(1 - outlines(nearness).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
+    seen = photo, nearness, away < RIM * max(away.shape)
     score, color = np.zeros(len(near), np.float32), np.zeros((len(near), 3), np.uint8)
-    seen = sight.photo, sight.nearness, sight.foreign
     _measure(view.row, seen, mesh.vertices, faces, OPTIONS.slack * mesh.spacing, score, color)
     if used is not None:
         masked = np.zeros((view.height + 1, view.width + 1), np.int32)
@@ -162,6 +167,44 @@ def score_faces(view: PhotoView, photo: NDArray[np.uint8], used: BoolArray | Non
         _drop_masked(view.row, masked, mesh.vertices, faces, score)
     usable = score > 0
     return FaceView(near[usable].astype(np.int32), score[usable], color[usable], sharpness(photo, used))
+
+
+def draw_nearness(view: PhotoView, vertices: FloatArray, faces: IndexArray) -> NDArray[np.float32]:
+    """Draw triangles (T, 3) into a photo: (H, W) 1 / depth, 0 without surface."""
+    pixels, size = np.empty((len(vertices), 3)), (view.height, view.width)
+    _project_all(view.row, vertices, pixels)
+    nearness = np.zeros(size, np.float32)
+    draw(pixels, faces, nearness, np.empty(size, np.int32))
+    return nearness
+
+
+@kernel
+def _project_all(camera: FloatArray, vertices: FloatArray, pixels: FloatArray) -> None:
+    """Write pixels x, y and 1 / depth (V, 3) of vertices; the last is -1 of invisible ones."""
+    for v in range(len(vertices)):
+        pixels[v, 0], pixels[v, 1], depth = project(camera, vertices[v, 0], vertices[v, 1], vertices[v, 2])
+        pixels[v, 2] = 1.0 / depth if depth > 0.0 else -1.0
+
+
+def outlines(nearness: NDArray[np.float32]) -> BoolArray:
+    """Mark the pixels on both sides of each jump of the depth, (H, W)."""
+    marks = np.zeros(nearness.shape, np.bool_)
+    for axis in (0, 1):
+        one, other = np.moveaxis(nearness, axis, 0)[:-1], np.moveaxis(nearness, axis, 0)[1:]
+        jump = np.abs(one - other) > JUMP * np.maximum(one, other)
+        np.moveaxis(marks, axis, 0)[:-1] |= jump
+        np.moveaxis(marks, axis, 0)[1:] |= jump
+    return marks
+
+
+@kernel
+def is_hidden(nearness: NDArray[np.float32], x: float, y: float, depth: float, slack: float) -> bool:
+    """Return whether all four pixels around a place show something nearer than its depth less a slack."""
+    height, width = nearness.shape
+    left, top = min(max(int(x - 0.5), 0), width - 1), min(max(int(y - 0.5), 0), height - 1)
+    right, below = min(left + 1, width - 1), min(top + 1, height - 1)
+    least = min(nearness[top, left], nearness[top, right], nearness[below, left], nearness[below, right])
+    return least * (depth - slack) > 1.0
 
 
 def sharpness(photo: NDArray[np.uint8], used: BoolArray | None = None) -> float:
@@ -201,9 +244,10 @@ def _measure(
 ) -> None:
     """Write area in pixels times cosine, and mean color, of triangles within the photo that face the camera.
 
-    `seen` is a `Sight`. Triangles hidden at the center or at two corners are left out.
+    `seen` are the photo, the nearness of `draw_nearness`, and the pixels beside outlines. Triangles hidden at the
+    center or at two corners are left out.
     """
-    photo, nearness, foreign = seen
+    photo, nearness, rim = seen
     height, width = photo.shape[0], photo.shape[1]
     x, y, corner = np.empty(4), np.empty(4), np.empty((4, 3))
     for f in range(len(faces)):
@@ -219,7 +263,7 @@ def _measure(
             inside = inside and BORDER_PX <= y[k] <= height - BORDER_PX
             if not inside:
                 break
-            beside = beside or foreign[int(y[k]), int(x[k])]
+            beside = beside or rim[int(y[k]), int(x[k])]
             if is_hidden(nearness, x[k], y[k], depth, slack):
                 hidden += 2 if k == 3 else 1
         if not inside or hidden > 1:
@@ -229,7 +273,7 @@ def _measure(
         area = -0.5 * ((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]))
         if cosine < MIN_COSINE or area <= 0.0:
             continue
-        score[f] = area * cosine * (OUTLINE_FACTOR if beside else 1.0)
+        score[f] = area * cosine * (RIM_FACTOR if beside else 1.0)
         for channel in range(3):
             total = 0.0
             for k in range(4):
