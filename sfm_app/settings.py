@@ -287,7 +287,9 @@ class Settings(Section):
 
     seed: int = Field(0, ge=0, lt=2**32, description="same seed, same result")
     workers: int = Field(0, ge=0, le=1024, description="parallel workers; 0: one per core")
-    quality: Quality = Field("normal", description="preset for image sizes and mesh resolution")
+    quality: Quality = Field(
+        "normal", description="draft: do the photos suffice? normal: to look at; high: for archives"
+    )
     max_memory_gb: float = Field(0.0, ge=0, le=4096, description="memory limit in GB; 0: four fifths of the machine's")
     plugins: bool = Field(True, description="load installed plug-ins; false: only the program's own methods")
     report: bool = Field(True, description="write OUT/report.html at the end of every run; false: do not")

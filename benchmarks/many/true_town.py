@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.geometry.triangles import cluster
-from sfm_app.meshing.ray_casting import Occluders, load_open3d
 from sfm_app.synthetic.cameras import Camera, Views
+from sfm_app.synthetic.render import cast_rays, ray_caster
 from sfm_app.types import CameraModel, PosedPhoto, Scene
 from sfm_app.types.scene import camera_center
 
@@ -56,18 +56,13 @@ def _observations(
     camera: Camera, views: Views, vertices: FloatArray, faces: NDArray[np.int64]
 ) -> tuple[list[tuple[FloatArray, NDArray[np.int64]]], FloatArray]:
     """Return per photo the pixels and numbers of the points that it sees, and all points (N, 3)."""
-    open3d = load_open3d()
-
-    scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
-    hidden, rng, points = Occluders(vertices, faces), np.random.default_rng(0), []
+    surface, rng, points = ray_caster(vertices, faces), np.random.default_rng(0), []
     inverse = np.linalg.inv(camera.K)
     for pose in views.cam_from_world.values():
         pixels = rng.uniform([0, 0], [camera.width, camera.height], (POINTS_PER_PHOTO, 2))
         ways = np.column_stack([pixels, np.ones(len(pixels))]) @ inverse.T @ pose[:, :3]
         center = camera_center(pose)
-        rays = np.column_stack([np.broadcast_to(center, ways.shape), ways]).astype(np.float32)
-        depth = scene.cast_rays(open3d.core.Tensor(rays), nthreads=1)["t_hit"].numpy()
+        depth = cast_rays(surface, center, ways)["t_hit"]
         points.append((center + depth[:, None] * ways)[depth < REACH_M])
     where = np.concatenate(points)
     photo = PosedPhoto("", camera.K, np.eye(3, 4), camera.width, camera.height)
@@ -80,6 +75,8 @@ def _observations(
         which, local = which[ahead], local[ahead] @ camera.K.T
         pixels = local[:, :2] / local[:, 2:]
         inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=1)
-        open_ones = ~hidden.is_hidden(camera_center(pose), 0.05, where[which[inside]])
+        ways = where[which[inside]] - camera_center(pose)
+        slack = 0.05 / np.linalg.norm(ways, axis=1)
+        open_ones = cast_rays(surface, camera_center(pose), ways)["t_hit"] > 1.0 - slack
         found.append((pixels[inside][open_ones], which[inside][open_ones]))
     return found, where

@@ -1,4 +1,4 @@
-"""Rays against a mesh: occlusion and nearest points, by Open3D."""
+"""Nearest points of a mesh, by Open3D."""
 
 import functools
 import importlib
@@ -74,22 +74,3 @@ class NearestNormals:
         good = np.linalg.norm(closest["points"].numpy() - points, axis=1) <= self._reach
         good &= ((normals * facing).sum(axis=1) > 0) & (length > 0)
         return np.where(good[:, None], normals / np.where(good, length, 1.0)[:, None], 0).astype(np.float32)
-
-
-class Occluders:
-    """Triangles that may hide points from cameras."""
-
-    def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
-        """Prepare for ray casting; vertices (V, 3), faces (T, 3) vertex indices."""
-        self._tensor = load_open3d().core.Tensor
-        self._scene = load_open3d().t.geometry.RaycastingScene(nthreads=1)
-        self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(faces.astype(np.uint32)))
-
-    def is_hidden(self, center: NDArray[np.float64], slack: float, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return (N,) whether a triangle lies between a point and the camera, beyond the first `slack` of the ray."""
-        ray = center - points
-        length = np.linalg.norm(ray, axis=1, keepdims=True)
-        start = points + ray * np.minimum(slack / np.maximum(length, 1e-300), 1.0)
-        rays = np.concatenate([start, center - start], axis=1).astype(np.float32)
-        hidden = self._scene.test_occlusions(self._tensor(rays), 0.0, 1.0, nthreads=1)
-        return np.asarray(hidden.numpy(), np.bool_)

@@ -9,8 +9,9 @@ from threading import Lock
 import numpy as np
 
 from sfm_app.geometry.poses import normalize
+from sfm_app.geometry.raster import NOTHING, project_vertices, rasterize
 from sfm_app.geometry.triangles import morton_order, unique_edges, vertex_normals
-from sfm_app.meshing.agreement import NOTHING, Pull, RefinePhoto, Sight, compare, project_vertices, rasterize
+from sfm_app.meshing.agreement import Pull, RefinePhoto, Sight, compare
 from sfm_app.meshing.fairness import Neighbors, find_displacements
 from sfm_app.tasks import Spread
 from sfm_app.types import PosedPhoto, Surface

@@ -77,8 +77,8 @@ def match_depths(
     # at the view's position inside the pixel
     inverse = planes[..., 0] + np.float32(view.sample_px - 0.5) * (planes[..., 1] + planes[..., 2])
     known = (planes[..., 0] > 0) & (inverse > 0) & (cost < NO_MATCH)
-    depth = remove_spill(np.divide(1, inverse, out=np.zeros_like(inverse), where=known), image)
-    return DepthEstimate(depth, np.where(depth > 0, np.maximum(1 - cost, 0), np.float32(0)))
+    depth = np.divide(1, inverse, out=np.zeros_like(inverse), where=known)
+    return DepthEstimate(depth, np.where(known, np.maximum(1 - cost, 0), np.float32(0)))
 
 
 def merge_hypotheses(depths: NDArray[np.float32], parallaxes: NDArray[np.float32], tolerance: float) -> DepthArray:

@@ -15,6 +15,7 @@ from sfm_app.types.arrays import BoolArray, DepthArray, FloatArray
 REACH_PX = BORDER + 1
 """A window centered this far from an outline still contains a pixel of the object; on a background without texture that
 pixel alone decides."""
+DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * REACH_PX + 1, 2 * REACH_PX + 1))
 AROUND_PX = 2 * REACH_PX
 """Largest row and column difference of the pixels that are compared with one."""
 BEHIND = 0.05
@@ -28,8 +29,6 @@ PLAIN_GRAY = 8.0
 """Largest standard deviation of the grays of a plain surface: matching cannot tell where it ends. Chosen by hand."""
 LEAST_ODDS = 8.0
 """Smallest likelihood ratio, what lies behind over the object, that removes a depth."""
-UNIFORM_LOG_LIKELIHOOD = 0.5 * np.log(2.0 * np.pi) - np.log(256.0)
-"""Log likelihood of a gray under the uniform distribution, for objects so thin that they consist of rim only."""
 
 
 def remove_spill(depth: DepthArray, image: GrayImage) -> DepthArray:
@@ -38,63 +37,68 @@ def remove_spill(depth: DepthArray, image: GrayImage) -> DepthArray:
     The grays of the object, away from its rim, and of what lies behind are each modeled as normally distributed around
     a pixel. Gaps narrower than two rims are not behind: they lie within surfaces.
     """
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * REACH_PX + 1, 2 * REACH_PX + 1))
-    empty = cv2.morphologyEx((depth <= 0).view(np.uint8), cv2.MORPH_OPEN, disc).view(np.bool_)
-    farthest = cv2.dilate(np.where(empty, np.float32(np.inf), depth), disc)
+    empty = _broad_areas(depth <= 0)
+    farthest = cv2.dilate(np.where(empty, np.float32(np.inf), depth), DISC)
     rim = (depth > 0) & (farthest > (1.0 + BEHIND) * depth)
     cleared, nearness = depth.copy(), np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
     _remove(nearness, empty, rim, image, cleared)
     return cleared
 
 
+def _broad_areas(empty: BoolArray) -> BoolArray:
+    return np.asarray(cv2.morphologyEx(empty.view(np.uint8), cv2.MORPH_OPEN, DISC)).view(np.bool_)
+
+
 @kernel
 def _remove(nearness: DepthArray, empty: BoolArray, rim: BoolArray, image: GrayImage, cleared: DepthArray) -> None:
     """Judge the pixels of the rim, by 1 / depth: on a plane it is linear."""
     height, width = nearness.shape
-    sums = np.empty((2, 3))  # number, sum and sum of squares of grays behind, and of the object's
+    # number, sum and sum of squares of the grays behind, of the object's, and of those of its rim
+    sums = np.empty((3, 3))
     for row in range(height):
         for col in range(width):
             if not rim[row, col]:
                 continue
-            near, across, down = nearness[row, col], slope(nearness, row, col, 0, 1), slope(nearness, row, col, 1, 0)
+            near, across, down = nearness[row, col], _slope(nearness, row, col, 0, 1), _slope(nearness, row, col, 1, 0)
             sums[:] = 0.0
             for i in range(max(row - AROUND_PX, 0), min(row + AROUND_PX + 1, height)):
                 for j in range(max(col - AROUND_PX, 0), min(col + AROUND_PX + 1, width)):
                     ahead = nearness[i, j] - (near + across * (j - col) + down * (i - row))
                     is_behind = empty[i, j] or (nearness[i, j] > 0 and ahead < -BEHIND * near)
-                    if not is_behind and (nearness[i, j] == 0 or rim[i, j] or ahead > BEHIND * near):
+                    if not is_behind and (nearness[i, j] == 0 or ahead > BEHIND * near):
                         continue
                     gray = float(image[i, j])
-                    kind = 0 if is_behind else 1
+                    kind = 0 if is_behind else 1 if not rim[i, j] else 2
                     sums[kind, 0] += 1.0
                     sums[kind, 1] += gray
                     sums[kind, 2] += gray * gray
-            if is_like(float(image[row, col]), sums[0], sums[1]):
+            if sums[1, 0] < LEAST_PIXELS:  # so thin that it consists of rim only
+                sums[1] = sums[2]
+            if _is_like(float(image[row, col]), sums[0], sums[1]):
                 cleared[row, col] = 0.0
 
 
 @kernel
-def is_like(gray: float, plain: FloatArray, textured: FloatArray) -> bool:
-    """Return whether a gray is more like those of a plain surface than like others, by their sums (3,).
-
-    The sums are the number, the sum and the sum of squares. False if the first surface is not plain.
-    """
-    if plain[0] < LEAST_PIXELS:
+def _is_like(gray: float, plain: FloatArray, other: FloatArray) -> bool:
+    """Return whether a gray is more like those of a plain surface than like others, by their sums (3,)."""
+    mean, variance = _describe(plain)
+    other_mean, other_variance = _describe(other)
+    if plain[0] < LEAST_PIXELS or variance > PLAIN_GRAY**2:
         return False
-    mean = plain[1] / plain[0]
-    variance = max(plain[2] / plain[0] - mean * mean, 0.0) + NOISE_GRAY**2
-    if variance > PLAIN_GRAY**2:
-        return False
-    odds = -0.5 * ((gray - mean) ** 2 / variance + np.log(variance)) - UNIFORM_LOG_LIKELIHOOD
-    if textured[0] >= LEAST_PIXELS:
-        mean = textured[1] / textured[0]
-        variance = max(textured[2] / textured[0] - mean * mean, 0.0) + NOISE_GRAY**2
-        odds += 0.5 * ((gray - mean) ** 2 / variance + np.log(variance)) + UNIFORM_LOG_LIKELIHOOD
-    return bool(odds > np.log(LEAST_ODDS))
+    odds = 0.5 * ((gray - other_mean) ** 2 / other_variance - (gray - mean) ** 2 / variance)
+    return bool(odds + 0.5 * np.log(other_variance / variance) > np.log(LEAST_ODDS))
 
 
 @kernel
-def slope(values: NDArray[np.float32], row: int, col: int, down: int, across: int) -> float:
+def _describe(sums: FloatArray) -> tuple[float, float]:
+    """Return mean and variance of grays."""
+    count = max(sums[0], 1.0)
+    mean = sums[1] / count
+    return mean, max(sums[2] / count - mean * mean, 0.0) + NOISE_GRAY**2
+
+
+@kernel
+def _slope(values: NDArray[np.float32], row: int, col: int, down: int, across: int) -> float:
     """Return the change of values from a pixel to the next in a direction: the smaller of both sides', not a jump."""
     height, width = values.shape
     i, j, k, m = row + down, col + across, row - down, col - across

@@ -58,16 +58,19 @@ class Evidence:
 
     def count_skies(self, places: FloatArray) -> FloatArray:
         """Return (N,) how many photos show the sky at places (N, 3)."""
-        blank, total = np.zeros_like(places), np.zeros(len(places))
+        total, nowhere = np.zeros(len(places)), np.zeros_like(places)
 
-        def look(number: int) -> NDArray[np.bool_]:
+        def look(number: int) -> NDArray[np.bool_] | None:
             view = self.views[number]
             depth = read_depth(self.dense_dir, view, "geometric")
             sky = np.where(depth == SKY, depth, np.float32(0))
-            return judge(places, blank, view, sky, view.sample_px, self.tolerance) == SEEN_THROUGH
+            if not sky.any():
+                return None
+            verdict = judge(places, nowhere, view, sky, view.sample_px, self.tolerance)
+            return np.asarray(verdict == SEEN_THROUGH, np.bool_)
 
         for seen in self.spread(look, range(len(self.views))):
-            total += seen
+            total += 0.0 if seen is None else seen
         return total
 
 

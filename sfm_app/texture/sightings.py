@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.raster import draw
 from sfm_app.geometry.triangles import Clusters, bucket_order, cluster, unique_edges
 from sfm_app.jit import kernel
-from sfm_app.meshing.agreement import draw
 from sfm_app.texture.views import POSE, PhotoView, project, sample
 from sfm_app.types import Surface
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
@@ -204,7 +204,7 @@ def is_hidden(nearness: NDArray[np.float32], x: float, y: float, depth: float, s
     left, top = min(max(int(x - 0.5), 0), width - 1), min(max(int(y - 0.5), 0), height - 1)
     right, below = min(left + 1, width - 1), min(top + 1, height - 1)
     least = min(nearness[top, left], nearness[top, right], nearness[below, left], nearness[below, right])
-    return least * (depth - slack) > 1.0
+    return bool(least * (depth - slack) > 1.0)
 
 
 def sharpness(photo: NDArray[np.uint8], used: BoolArray | None = None) -> float:

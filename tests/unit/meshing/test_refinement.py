@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm_app.geometry.raster import Raster
 from sfm_app.geometry.triangles import areas, unique_edges, vertex_normals
-from sfm_app.meshing.agreement import Raster, Sight, compare
+from sfm_app.meshing.agreement import Sight, compare
 from sfm_app.meshing.refinement import Sights, finest_pixels, look, refine, split_long_edges
 from sfm_app.synthetic.shapes import ball
 from sfm_app.types import Surface

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.meshing.agreement import NOTHING, rasterize
+from sfm_app.geometry.raster import NOTHING, rasterize
 from sfm_app.types import PosedPhoto
 
 K = np.array([[100.0, 0.0, 32.0], [0.0, 100.0, 24.0], [0.0, 0.0, 1.0]])
