@@ -21,7 +21,7 @@ from sfm_app.types.arrays import FloatArray, IndexArray
 
 GAP = 8.0
 """Longest edge of a measured triangle, in distances of points: longer ones close a gap. Chosen by hand."""
-NARROW = 20.0
+NARROW = 16.0
 """Width of a patch that is closed even where no photo looks at it, in distances of points. Chosen by hand."""
 LEAST_FACING = 0.25
 """Least mean cosine at which photos look at a wider patch, and not along it. Chosen by hand."""
