@@ -10,7 +10,7 @@ from sfm_app.types import PosedPhoto
 from sfm_app.types.arrays import FloatArray, IndexArray
 
 NOTHING = -1
-"""Triangle of a pixel that shows none."""
+"""Triangle of a pixel that shows none. By definition."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
