@@ -5,7 +5,7 @@ from a photo to a point says that the tetrahedra before the point are free, and 
 with the least contradiction is a closed surface; where photos show nothing, it is small.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -126,9 +126,7 @@ class Cells(NamedTuple):
     """Tetrahedra around the points."""
 
 
-def cut_surface(
-    cloud: Cloud, sights: Sights, count_skies: Callable[[FloatArray], FloatArray] | None = None, *, close: bool = False
-) -> tuple[Surface, FloatArray]:
+def cut_surface(cloud: Cloud, sights: Sights, *, close: bool = False) -> tuple[Surface, FloatArray]:
     """Return the cut, oriented, and (V,) the points' steps; open where it leads beyond all points, unless `close`."""
     from scipy.spatial import Delaunay
 
@@ -145,9 +143,6 @@ def cut_surface(
     _cast(cells, sight, OPTIONS.sigma * cloud.step / scale, OPTIONS.behind, crossed, ends)
     _add_shape(cells, OPTIONS.beta, crossed)
     capacity = np.rint(np.minimum(UNIT * crossed, 2.0**30)).astype(np.int32)
-    if count_skies is not None:  # what a photo sees the sky at is free, though no line of sight ends there
-        inner = np.flatnonzero((cells.corners < len(cloud.points)).all(axis=1))
-        ends[inner] += count_skies(points[cells.corners[inner]].mean(axis=1) * scale + origin)
     excess = np.rint(UNIT * ends).astype(np.int64)
     if close:
         excess[(cells.corners >= len(cloud.points)).any(axis=1)] += 2**40  # beyond all points is free

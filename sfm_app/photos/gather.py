@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 from sfm_app.errors import InputError
 from sfm_app.files import fingerprint, is_below, read_object, replace_atomically, replace_folder
 from sfm_app.operating_system import share_bytes
-from sfm_app.photos.files import is_video, list_files, list_photos, read_head, resolve_file
+from sfm_app.photos.files import HINT, is_video, list_files, list_photos, read_head, resolve_file
 from sfm_app.photos.source import ParallelMap, digest
 
 MOST_ZIP_BYTES = 100_000_000_000
@@ -25,7 +25,7 @@ MOST_NAME_BYTES = 255
 """Bytes of a name on common file systems."""
 PREVIEWS, NOTES = (".lrf", ".lrv", ".thm"), (".srt", ".xmp", ".txt")
 """Suffixes of what cameras write beside videos: small copies of them, and texts."""
-MISSING_HINT = 'name photos, folders or a ZIP archive, with quotes around a name with spaces: "My photos"'
+MISSING_HINT = f'{HINT}, with quotes around a name with spaces: "My photos"'
 ZIP_HINT = "unpack it yourself, and name the folder"
 
 
@@ -63,7 +63,7 @@ def expand(inputs: Sequence[Path]) -> list[Path]:
         matches = [] if path.exists() else [Path(name) for name in glob.glob(str(path), recursive=True)]  # noqa: PTH207
         found |= set(matches or [path])
     if not found:
-        raise InputError("no photos are named", hint="name photos, folders, a video or a ZIP archive")
+        raise InputError("no photos are named", hint=HINT)
     return sorted({path.resolve(): path for path in sorted(found)}.values(), key=lambda path: str(path.resolve()))
 
 

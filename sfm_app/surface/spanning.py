@@ -13,7 +13,7 @@ from sfm_app.geometry.triangles import select_faces, unique_edges
 from sfm_app.meshing.cleaning import make_manifold
 from sfm_app.meshing.refinement import finest_pixels
 from sfm_app.meshing.tetrahedra import OPTIONS, Cloud, choose_sights, cut_surface, thin
-from sfm_app.meshing.visibility import CONFIRMED, EMPTY, SEEN_THROUGH, SKY, judge
+from sfm_app.meshing.visibility import CONFIRMED, EMPTY, SEEN_THROUGH, judge
 from sfm_app.stereo import View
 from sfm_app.tasks import Spread
 from sfm_app.types import Surface
@@ -56,23 +56,6 @@ class Evidence:
 
         return self.spread(look, range(len(self.views)))
 
-    def count_skies(self, places: FloatArray) -> FloatArray:
-        """Return (N,) how many photos show the sky at places (N, 3)."""
-        total, nowhere = np.zeros(len(places)), np.zeros_like(places)
-
-        def look(number: int) -> NDArray[np.bool_] | None:
-            view = self.views[number]
-            depth = read_depth(self.dense_dir, view, "geometric")
-            sky = np.where(depth == SKY, depth, np.float32(0))
-            if not sky.any():
-                return None
-            verdict = judge(places, nowhere, view, sky, view.sample_px, self.tolerance)
-            return np.asarray(verdict == SEEN_THROUGH, np.bool_)
-
-        for seen in self.spread(look, range(len(self.views))):
-            total += 0.0 if seen is None else seen
-        return total
-
 
 def gather(records: NDArray[np.void], views: Sequence[View]) -> Cloud:
     """Return the fused points (N,), from `open_points`, about as dense as the depth maps tell them apart."""
@@ -110,7 +93,7 @@ def span(
     number, cloud = np.cumsum(kept) - 1, cloud.select(kept)
     centers = np.stack([view.center for view in evidence.views])
     sights = choose_sights([number[at[kept[at]]] for at in seen], centers, len(cloud.points))
-    surface, step = cut_surface(cloud, sights, evidence.count_skies, close=close)
+    surface, step = cut_surface(cloud, sights, close=close)
     return make_manifold(smooth(surface if close else drop_guesses(surface, step, evidence))), witnesses
 
 

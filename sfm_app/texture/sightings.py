@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.raster import draw
-from sfm_app.geometry.triangles import Clusters, bucket_order, cluster, unique_edges
+from sfm_app.geometry.triangles import Clusters, bucket_order, cluster, number_vertices, unique_edges
 from sfm_app.jit import kernel
 from sfm_app.texture.views import POSE, PhotoView, project, sample
 from sfm_app.types import Surface
@@ -119,8 +119,8 @@ JUMP = 0.01
 """Relative depth difference of adjacent pixels at an outline. Chosen by hand: a plane has it where it is seen at 2
 degrees in a photo of 3 000 pixels."""
 RIM, RIM_FACTOR = 0.002, 0.25
-"""Distance from an outline, in longer sides of the photo: two pixels of a depth map; and the factor on the score of
-triangles within it: where the surface is off, the photo shows the foreground or background."""
+"""Distance from an outline in rows and columns, in longer sides of the photo: two pixels of a depth map; and the
+factor on the score of triangles within it: where the surface is off, the photo shows the foreground or background."""
 MASK_MARGIN_PX = 1.0
 """A triangle this close to a masked pixel is not used, because colors are interpolated between pixels."""
 
@@ -154,11 +154,13 @@ class FaceView:
 
 def score_faces(view: PhotoView, photo: NDArray[np.uint8], used: BoolArray | None, mesh: Facets) -> FaceView:
     """Score the triangles in a photo (height, width, 3) of the view's size; `used` masks its usable pixels."""
+    sharp = sharpness(photo, used)  # before the depth buffer: both need as much memory
     near = mesh.clusters.find_in_cone(view.center, view.axis, view.widest_angle)
     faces = mesh.faces[near]
-    nearness = draw_nearness(view, mesh.vertices, faces)
-    away = cv2.distanceTransform(1 - outlines(nearness).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
-    seen = photo, nearness, away < RIM * max(away.shape)
+    nearness = _draw_nearness(view, mesh.vertices, faces)
+    jumps, side = np.zeros(nearness.shape, np.uint8), 2 * round(RIM * max(nearness.shape)) + 1
+    _mark_jumps(nearness, jumps)
+    seen = photo, nearness, cv2.dilate(jumps, np.ones((side, side), np.uint8))
     score, color = np.zeros(len(near), np.float32), np.zeros((len(near), 3), np.uint8)
     _measure(view.row, seen, mesh.vertices, faces, OPTIONS.slack * mesh.spacing, score, color)
     if used is not None:
@@ -166,15 +168,16 @@ def score_faces(view: PhotoView, photo: NDArray[np.uint8], used: BoolArray | Non
         np.cumsum(np.cumsum(~used, axis=0, dtype=np.int32), axis=1, out=masked[1:, 1:])
         _drop_masked(view.row, masked, mesh.vertices, faces, score)
     usable = score > 0
-    return FaceView(near[usable].astype(np.int32), score[usable], color[usable], sharpness(photo, used))
+    return FaceView(near[usable].astype(np.int32), score[usable], color[usable], sharp)
 
 
-def draw_nearness(view: PhotoView, vertices: FloatArray, faces: IndexArray) -> NDArray[np.float32]:
+def _draw_nearness(view: PhotoView, vertices: FloatArray, faces: IndexArray) -> NDArray[np.float32]:
     """Draw triangles (T, 3) into a photo: (H, W) 1 / depth, 0 without surface."""
-    pixels, size = np.empty((len(vertices), 3)), (view.height, view.width)
-    _project_all(view.row, vertices, pixels)
+    used, own = number_vertices(faces)
+    pixels, size = np.empty((len(used), 3)), (view.height, view.width)
+    _project_all(view.row, vertices[used], pixels)
     nearness = np.zeros(size, np.float32)
-    draw(pixels, faces, nearness, np.empty(size, np.int32))
+    draw(pixels, own, nearness, np.empty(size, np.int32))
     return nearness
 
 
@@ -186,19 +189,21 @@ def _project_all(camera: FloatArray, vertices: FloatArray, pixels: FloatArray) -
         pixels[v, 2] = 1.0 / depth if depth > 0.0 else -1.0
 
 
-def outlines(nearness: NDArray[np.float32]) -> BoolArray:
-    """Mark the pixels on both sides of each jump of the depth, (H, W)."""
-    marks = np.zeros(nearness.shape, np.bool_)
-    for axis in (0, 1):
-        one, other = np.moveaxis(nearness, axis, 0)[:-1], np.moveaxis(nearness, axis, 0)[1:]
-        jump = np.abs(one - other) > JUMP * np.maximum(one, other)
-        np.moveaxis(marks, axis, 0)[:-1] |= jump
-        np.moveaxis(marks, axis, 0)[1:] |= jump
-    return marks
+@kernel
+def _mark_jumps(nearness: NDArray[np.float32], jumps: NDArray[np.uint8]) -> None:
+    """Mark the pixels on both sides of each jump of the depth."""
+    height, width = nearness.shape
+    for y in range(height):
+        for x in range(width):
+            for i, j in ((y + 1, x), (y, x + 1)):
+                if i < height and j < width:
+                    one, other = nearness[y, x], nearness[i, j]
+                    if abs(one - other) > JUMP * max(one, other):
+                        jumps[y, x] = jumps[i, j] = 1
 
 
 @kernel
-def is_hidden(nearness: NDArray[np.float32], x: float, y: float, depth: float, slack: float) -> bool:
+def _is_hidden(nearness: NDArray[np.float32], x: float, y: float, depth: float, slack: float) -> bool:
     """Return whether all four pixels around a place show something nearer than its depth less a slack."""
     height, width = nearness.shape
     left, top = min(max(int(x - 0.5), 0), width - 1), min(max(int(y - 0.5), 0), height - 1)
@@ -244,7 +249,7 @@ def _measure(
 ) -> None:
     """Write area in pixels times cosine, and mean color, of triangles within the photo that face the camera.
 
-    `seen` are the photo, the nearness of `draw_nearness`, and the pixels beside outlines. Triangles hidden at the
+    `seen` are the photo, the nearness of `_draw_nearness`, and the pixels beside outlines. Triangles hidden at the
     center or at two corners are left out.
     """
     photo, nearness, rim = seen
@@ -263,8 +268,8 @@ def _measure(
             inside = inside and BORDER_PX <= y[k] <= height - BORDER_PX
             if not inside:
                 break
-            beside = beside or rim[int(y[k]), int(x[k])]
-            if is_hidden(nearness, x[k], y[k], depth, slack):
+            beside = beside or rim[int(y[k]), int(x[k])] > 0
+            if _is_hidden(nearness, x[k], y[k], depth, slack):
                 hidden += 2 if k == 3 else 1
         if not inside or hidden > 1:
             continue

@@ -117,26 +117,6 @@ def test_a_point_inside_that_photos_claim_to_see_does_not_dent_the_ball():
     assert volume(found) == pytest.approx(4.0 / 3.0 * np.pi, rel=0.02)
 
 
-def test_where_photos_show_the_sky_is_no_surface():
-    points, normals = ball_points(0.002)
-    halves = cloud_of(points, normals).select(np.abs(points[:, 2]) > 0.3)
-    sights = choose_sights(photos_that_face(halves), CENTERS, len(halves.points))
-
-    joined, apart = (
-        cut_surface(halves, sights, lambda places, photos=photos: photos * (np.abs(places[:, 2]) < 0.3))[0]
-        for photos in (0.0, float(len(CENTERS)))
-    )
-
-    assert_closed(joined)
-    walls = list[float]()
-    for found in (joined, apart):
-        middle = found.vertices[found.faces].mean(axis=1)
-        at_gap = (np.abs(middle[:, 2]) < 0.2) & (np.linalg.norm(middle[:, :2], axis=1) > 0.85)
-        walls.append(areas(found.vertices, found.faces)[at_gap].sum())
-    assert walls[0] > 2.0 and walls[1] < 0.3
-    assert volume(apart) < volume(joined)
-
-
 def square(width, axis, at, side):
     """Points STEP apart on a square around an axis, with the normal along the axis to a side (-1 or 1)."""
     steps = round(width / STEP)

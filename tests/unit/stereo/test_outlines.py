@@ -99,6 +99,16 @@ def test_an_outline_between_equal_grays_stays():
 
 
 def test_a_slanted_plane_stays():
-    given_depth = (3.0 / (1 - 0.004 * (COL - 40))).astype(np.float32)
+    given_depth = (3.0 / (1 - 0.008 * (COL - 40))).astype(np.float32)
 
     np.testing.assert_array_equal(remove_spill(given_depth, photo(60, 200)), given_depth)
+
+
+def test_a_seam_over_a_textured_surface_stays():
+    """Matching tells where it ends."""
+    behind = np.where(DISC, 0.0, 4.0).astype(np.float32)
+    given_depth = np.where(DISC | SEAM, depths(ROW >= 0), behind)
+    texture = np.random.default_rng(0).integers(160, 240, DISC.shape)
+    gray = np.where(DISC, photo(60, 0), texture).astype(np.uint8)
+
+    np.testing.assert_array_equal(remove_spill(given_depth, gray), given_depth)

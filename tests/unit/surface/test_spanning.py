@@ -87,7 +87,7 @@ def open_edges(surface):
 
 
 NARROW, WIDE = 0.5, 1.2
-"""Sides of holes: 20 and 48 distances of points; a square is narrow up to 40."""
+"""Sides of holes: 20 and 48 distances of points; a square is narrow up to 32."""
 
 
 @pytest.mark.parametrize(
