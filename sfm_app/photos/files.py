@@ -226,13 +226,12 @@ def _textures(folder: Path, names: Sequence[str]) -> dict[str, str]:
 
 def _bad_path_error(path: Path) -> InputError:
     if not path.exists():
-        kind = "file" if path.suffix.lower() in (*EXTENSIONS, ".zip") else "folder"
         siblings = path.parent.iterdir() if os.access(path.parent, os.R_OK) and path.parent.is_dir() else ()
         similar = get_close_matches(path.name, sorted(other.name for other in siblings), 1)
         suggestion = f"\nis it {path.with_name(similar[0])}?" if similar else ""
-        return InputError(f"no such {kind}: {path}", hint=f"{HINT}{suggestion}")
+        return InputError(f"not found: {path}", hint=f"{HINT}{suggestion}")
     if path.suffix.lower() not in EXTENSIONS or not path.is_file():
-        return InputError(f"not a folder: {path}", hint=HINT)
+        return InputError(f"neither a folder, a video nor a ZIP archive: {path}", hint=HINT)
     if not os.access(path, os.R_OK):
         return InputError(f"cannot read {path}: permission denied")
     hint = "copy the file again, or save it as MP4"

@@ -103,7 +103,7 @@ def find(inputs: Sequence[Path], out: Path, masks: str = "") -> Gathered:
                 elif source != mask_place:
                     found.add(f"{folder}/{name}", label, source)
         elif not path.is_file():
-            raise InputError(f"no such file or folder: {path}", hint=MISSING_HINT)
+            raise InputError(f"not found: {path}", hint=MISSING_HINT)
         elif not is_video(read_head(path)) and zipfile.is_zipfile(path):
             folder = free(path.stem)
             for name, member in _members(path).items():

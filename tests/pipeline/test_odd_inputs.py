@@ -259,12 +259,12 @@ def test_what_lies_in_the_output_folder_never_stops_a_run(folder, tmp_path, case
 
 
 COMMANDS = {
-    "a missing folder": ("{here}/nowhere -o {here}/out", 3, "no such folder"),
-    "a photo as the folder": ("{photos}/a.jpg -o {here}/out", 3, "not a folder"),
-    "a missing video": ("{here}/none.mp4 -o {here}/out", 3, "no such file"),
+    "a missing folder": ("{here}/nowhere -o {here}/out", 3, "not found"),
+    "a photo alone": ("{photos}/a.jpg -o {here}/out", 3, "neither a folder, a video nor a ZIP archive"),
+    "a missing video": ("{here}/none.mp4 -o {here}/out", 3, "not found"),
     "a text file named like a video": ("{videos}/text.mp4 -o {here}/out", 3, "not a video"),
     "a list of videos": ("{videos}/list.mp4 -o {here}/out", 3, "not a video"),
-    "a URL": ("http://127.0.0.1/clip.mp4 -o {here}/out", 3, "no such file"),
+    "a URL": ("http://127.0.0.1/clip.mp4 -o {here}/out", 3, "not found"),
     "an empty video": ("{videos}/empty.mov -o {here}/out", 3, "empty.mov is empty"),
     "a folder named like a video": ("{videos}/folder.mp4 -o {here}/out", 3, "the folder is empty"),
     "the first half of a video": ("{videos}/half.mp4 -o {here}/out", 3, "damaged, cut off, or no QuickTime"),
@@ -274,8 +274,8 @@ COMMANDS = {
     "sound without a video": ("{videos}/sound.avi -o {here}/out", 3, "sound, but no video in this AVI"),
     "a camera that does not move": ("{videos}/still.avi -o {here}/out", 3, "the camera does not move"),
     "several inputs without an output folder": ("{photos} {photos}/a.jpg", 2, "no folder for the results"),
-    "a wildcard without a file": ("{here}/none*.jpg -o {here}/out", 3, "no such folder"),
-    "a missing photo among others": ("{photos}/a.jpg {here}/none.jpg -o {here}/out", 3, "no such file or folder"),
+    "a wildcard without a file": ("{here}/none*.jpg -o {here}/out", 3, "not found"),
+    "a missing photo among others": ("{photos}/a.jpg {here}/none.jpg -o {here}/out", 3, "not found"),
     "a list of photos with several inputs":
         ("{photos} {photos}/a.jpg -o {here}/out --images {here}/list.txt", 2, "--images"),
     "an input as masks": ("{photos} {photos}/a.jpg -o {here}/out --masks {photos}", 3, "photos and masks"),

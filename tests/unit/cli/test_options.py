@@ -135,4 +135,4 @@ def test_scripts_for_older_versions_still_run(tmp_path, capsys):
     with pytest.raises(SystemExit) as exit_:
         main(["run", str(tmp_path / "none"), "-o", str(tmp_path / "out"), "--no-picture"])
     assert exit_.value.code == 3
-    assert "no such folder" in capsys.readouterr().err
+    assert "not found" in capsys.readouterr().err

@@ -182,7 +182,7 @@ def test_a_missing_folder_ends_with_exit_code_3_and_a_similar_name_is_offered(tm
     (tmp_path / "Regal 2019 (für Oma)").mkdir()
     (tmp_path / "wheels").mkdir()
     similar, other = (call("run", tmp_path / name, "-o", tmp_path / "out", "-q") for name in ("Regal 2019", "fox"))
-    assert similar.exit_code == other.exit_code == 3 and "no such folder" in other.stderr
+    assert similar.exit_code == other.exit_code == 3 and "not found" in other.stderr
     assert similar.stderr.endswith(f"\nis it {tmp_path / 'Regal 2019 (für Oma)'}?\n")
     assert other.stderr.count("\n") == 2 and "is it" not in other.stderr
 
