@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.stereo.outlines import remove_spill
 from sfm_app.stereo.patch_match import NO_MATCH, fit_planes, improve_planes, plane_normals
 from sfm_app.stereo.plain_areas import enclosed_pixels, fill_planar_areas, plain_walls, surfaceless_areas
 from sfm_app.stereo.rectify import depths_from_disparities, disparities, rectify
@@ -177,7 +176,7 @@ def confirm_depths(
     min_agreeing: int,
     tolerance: float,
 ) -> DepthMap | Rejected:
-    """Keep depths that enough other maps confirm; remove spill and specks, fill plain walls, add normals.
+    """Keep depths that enough other maps confirm; remove specks, fill plain walls, add normals.
 
     The required number is `min_agreeing` >= 1; one more at low correlation; three more at very
     low correlation. There, a depth must also belong to a plain wall or lie between surer depths. Depths in skies are
@@ -196,7 +195,7 @@ def confirm_depths(
     walls = plain_walls(weak, sound)
     sound &= ~weak | walls | enclosed_pixels(sound & ~weak)
     confirmed = np.where(sound & ~surfaceless_areas(confidence, sound), estimate.depth, np.float32(0))
-    confirmed = filter_speckles(remove_spill(confirmed, image), tolerance)
+    confirmed = filter_speckles(confirmed, tolerance)
     planes = fit_planes(fill_planar_areas(confirmed, image, tolerance, walls))
     if not planes.any():
         return Rejected("no depth is confirmed by other photos")

@@ -1,108 +1,192 @@
-"""Outlines of depth maps: windows that reach an object spread its depth over what lies behind, in every photo alike.
+"""Outlines of depth maps: which pixels belong to the surface in front, and which to what lies behind.
 
-A plain background has no texture of its own, so no check between photos removes this spill; but its gray tells.
+Windows that reach an object spread its depth over what lies behind, in every photo alike, so that no check between
+depth maps removes it. Beside an outline each pixel therefore chooses once more between both surfaces: by its own
+difference from the other photos, and by the grays of both surfaces around.
 """
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.stereo.patch_match import BORDER
-from sfm_app.stereo.view import GrayImage
-from sfm_app.types.arrays import BoolArray, DepthArray, FloatArray
+from sfm_app.stereo.patch_match import BORDER, PhotoStack, PlaneArray, plane_normals, planes_of, stack_photos, warp
+from sfm_app.stereo.view import DepthMap, GrayImage, View
+from sfm_app.types.arrays import BoolArray, FloatArray
 
 REACH_PX = BORDER + 1
 """A window centered this far from an outline still contains a pixel of the object; on a background without texture that
 pixel alone decides."""
 DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * REACH_PX + 1, 2 * REACH_PX + 1))
 AROUND_PX = 2 * REACH_PX
-"""Largest row and column difference of the pixels that are compared with one."""
+"""Largest row and column difference of the pixels whose grays describe a surface."""
 BEHIND = 0.05
-"""Relative depth difference beyond which a pixel lies behind another. Chosen by hand: a plane has it within `REACH_PX`
-where it is seen at 5 degrees."""
+"""Relative difference of nearness beyond which a pixel lies behind another. Chosen by hand: a plane has it within
+`REACH_PX` where it is seen at 5 degrees."""
+SAME = 0.02
+"""Relative difference of nearness within which a pixel keeps its own depth. Chosen by hand."""
 LEAST_PIXELS = 5
-"""Fewest pixels whose mean and variance describe a surface."""
+"""Fewest pixels whose grays describe a surface."""
 NOISE_GRAY = 3.0
-"""Smallest standard deviation of gray levels: sensor noise and compression artifacts."""
-PLAIN_GRAY = 8.0
-"""Largest standard deviation of the grays of a plain surface: matching cannot tell where it ends. Chosen by hand."""
-LEAST_ODDS = 8.0
-"""Smallest likelihood ratio, what lies behind over the object, that removes a depth."""
+"""Difference from another photo, in gray levels, that is e times less likely: sensor noise and inexact depths."""
+WORST_GRAY = 20.0
+"""Difference beyond which a pixel is of another surface, no matter how large. Chosen by hand."""
+SPREAD_GRAY = 8.0
+"""Standard deviation of grays around each gray of a surface. Chosen on `garden`: 5 is as good."""
+ALIKE = np.exp(-0.5 * (np.arange(256) / SPREAD_GRAY) ** 2)
+UNIFORM = SPREAD_GRAY * np.sqrt(2.0 * np.pi) / 256.0
+"""Likelihood of a gray of which nothing is known, in the units of `ALIKE`."""
+STEPS = np.array(sorted((np.argwhere(DISC) - REACH_PX).tolist(), key=lambda step: step[0] ** 2 + step[1] ** 2))
+"""(N, 2) rows and columns of the pixels within reach, nearest first."""
 
 
-def remove_spill(depth: DepthArray, image: GrayImage) -> DepthArray:
-    """Remove depths beside an outline, (H, W), if their gray is like that of a plain surface, or of nothing, behind it.
+def sharpen_outlines(
+    maps: DepthMap, view: View, image: GrayImage, others: Sequence[tuple[View, GrayImage]]
+) -> DepthMap:
+    """Let each pixel within `REACH_PX` of an outline choose between both surfaces, also where its depth is unknown.
 
-    The grays of the object, away from its rim, and of what lies behind are each modeled as normally distributed around
-    a pixel. Gaps narrower than two rims are not behind: they lie within surfaces.
+    Behind an object may be nothing: a gap without depths that is wider than two rims.
     """
-    empty = _broad_areas(depth <= 0)
-    farthest = cv2.dilate(np.where(empty, np.float32(np.inf), depth), DISC)
-    rim = (depth > 0) & (farthest > (1.0 + BEHIND) * depth)
-    cleared, nearness = depth.copy(), np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
-    _remove(nearness, empty, rim, image, cleared)
-    return cleared
-
-
-def _broad_areas(empty: BoolArray) -> BoolArray:
-    return np.asarray(cv2.morphologyEx(empty.view(np.uint8), cv2.MORPH_OPEN, DISC)).view(np.bool_)
+    planes, known = planes_of(maps.depth, maps.normals, view), maps.depth > 0
+    empty = np.asarray(cv2.morphologyEx((~known).view(np.uint8), cv2.MORPH_OPEN, DISC)).view(np.bool_)
+    nearness = planes[..., 0].copy()
+    lowest = cv2.erode(np.where(known | empty, nearness, np.float32(np.inf)), DISC)
+    beside = cv2.dilate(nearness, DISC) > (1.0 + BEHIND) * lowest
+    rim = known & (nearness > (1.0 + BEHIND) * lowest)
+    to_center = np.float32(0.5 - view.sample_px)
+    planes[..., 0] += to_center * (planes[..., 1] + planes[..., 2])
+    chosen, changed = planes.copy(), np.zeros(known.shape, np.bool_)
+    _choose(image, planes, (empty, beside, rim), stack_photos(view, others), chosen, changed)
+    chosen[..., 0] -= to_center * (chosen[..., 1] + chosen[..., 2])
+    chosen[chosen[..., 0] <= 0] = 0.0
+    depth, normals = maps.depth.copy(), maps.normals.copy()
+    depth[changed] = np.divide(1.0, chosen[..., 0], out=np.zeros_like(depth), where=chosen[..., 0] > 0)[changed]
+    normals[changed] = plane_normals(chosen, view)[changed]
+    return DepthMap(depth, normals)
 
 
 @kernel
-def _remove(nearness: DepthArray, empty: BoolArray, rim: BoolArray, image: GrayImage, cleared: DepthArray) -> None:
-    """Judge the pixels of the rim, by 1 / depth: on a plane it is linear."""
-    height, width = nearness.shape
-    # number, sum and sum of squares of the grays behind, of the object's, and of those of its rim
-    sums = np.empty((3, 3))
-    for row in range(height):
-        for col in range(width):
-            if not rim[row, col]:
+def _choose(
+    image: GrayImage, planes: PlaneArray, masks: tuple[BoolArray, BoolArray, BoolArray], others: PhotoStack,
+    chosen: PlaneArray, changed: BoolArray,
+) -> None:  # fmt: skip
+    """Fill in the planes that pixels change to; `masks` are (H, W): empty, beside an outline, and in front of one."""
+    empty, beside, rim = masks
+    height, width = image.shape
+    near, far, costs = np.empty(3), np.empty(3), np.empty(len(others[3]))
+    for row in range(1, height - 1):
+        for col in range(1, width - 1):
+            if not beside[row, col] or not _find_both(planes, empty, row, col, near, far):
                 continue
-            near, across, down = nearness[row, col], _slope(nearness, row, col, 0, 1), _slope(nearness, row, col, 1, 0)
-            sums[:] = 0.0
-            for i in range(max(row - AROUND_PX, 0), min(row + AROUND_PX + 1, height)):
-                for j in range(max(col - AROUND_PX, 0), min(col + AROUND_PX + 1, width)):
-                    ahead = nearness[i, j] - (near + across * (j - col) + down * (i - row))
-                    is_behind = empty[i, j] or (nearness[i, j] > 0 and ahead < -BEHIND * near)
-                    if not is_behind and (nearness[i, j] == 0 or ahead > BEHIND * near):
-                        continue
-                    gray = float(image[i, j])
-                    kind = 0 if is_behind else 1 if not rim[i, j] else 2
-                    sums[kind, 0] += 1.0
-                    sums[kind, 1] += gray
-                    sums[kind, 2] += gray * gray
-            if sums[1, 0] < LEAST_PIXELS:  # so thin that it consists of rim only
-                sums[1] = sums[2]
-            if _is_like(float(image[row, col]), sums[0], sums[1]):
-                cleared[row, col] = 0.0
+            odds = _gray_odds(image, planes, empty, rim, row, col, near, far)
+            if far[0] > 0.0:
+                odds += _mismatch(image, row, col, near, others, costs) - _mismatch(image, row, col, far, others, costs)
+            if np.isnan(odds):
+                continue
+            plane, own = far if odds > 0.0 else near, planes[row, col, 0]
+            if abs(own - plane[0]) > SAME * plane[0]:
+                changed[row, col] = True
+                for c in range(3):
+                    chosen[row, col, c] = plane[c]
 
 
 @kernel
-def _is_like(gray: float, plain: FloatArray, other: FloatArray) -> bool:
-    """Return whether a gray is more like those of a plain surface than like others, by their sums (3,)."""
-    mean, variance = _describe(plain)
-    other_mean, other_variance = _describe(other)
-    if plain[0] < LEAST_PIXELS or variance > PLAIN_GRAY**2:
+def _find_both(planes: PlaneArray, empty: BoolArray, row: int, col: int, near: FloatArray, far: FloatArray) -> bool:
+    """Fill in the planes, about a pixel, of the surfaces before and behind the outline; 0 for nothing behind it."""
+    height, width, count, is_empty = empty.shape[0], empty.shape[1], 0, False
+    for k in range(len(STEPS)):
+        down, right = STEPS[k]
+        i, j = row + down, col + right
+        if not (0 <= i < height and 0 <= j < width):
+            continue
+        is_empty = is_empty or empty[i, j]
+        q, across, along = float(planes[i, j, 0]), float(planes[i, j, 1]), float(planes[i, j, 2])
+        here = q - across * right - along * down
+        if q <= 0.0 or here <= 0.0:
+            continue
+        # two surfaces differ at this pixel, and at the other one: slopes are inexact
+        there = near[0] + near[1] * right + near[2] * down
+        if count == 1 and not (
+            abs(here - near[0]) > BEHIND * max(here, near[0]) and abs(q - there) > BEHIND * max(q, there)
+        ):
+            continue
+        plane = near if count == 0 else far
+        plane[0], plane[1], plane[2] = here, across, along
+        count += 1
+        if count == 2:
+            break
+    if count == 0 or (count == 1 and not is_empty):
         return False
-    odds = 0.5 * ((gray - other_mean) ** 2 / other_variance - (gray - mean) ** 2 / variance)
-    return bool(odds + 0.5 * np.log(other_variance / variance) > np.log(LEAST_ODDS))
+    if count == 1:
+        far[:] = 0.0
+    elif far[0] > near[0]:
+        for c in range(3):
+            near[c], far[c] = far[c], near[c]
+    return True
 
 
 @kernel
-def _describe(sums: FloatArray) -> tuple[float, float]:
-    """Return mean and variance of grays."""
-    count = max(sums[0], 1.0)
-    mean = sums[1] / count
-    return mean, max(sums[2] / count - mean * mean, 0.0) + NOISE_GRAY**2
+def _mismatch(image: GrayImage, row: int, col: int, plane: FloatArray, others: PhotoStack, costs: FloatArray) -> float:
+    """Return the mean difference of nine pixels from the better half of the other photos, in `NOISE_GRAY`.
+
+    nan where no other photo shows them.
+    """
+    stack, stride, sizes, projections = others
+    count = 0
+    for k in range(len(projections)):
+        u, v, uu, uv, vu, vv = warp(projections[k], col + 0.5, row + 0.5, plane)
+        du, dv = abs(uu) + abs(uv), abs(vu) + abs(vv)
+        if not (u - du >= 0.5 and v - dv >= 0.5 and u + du < sizes[k, 1] - 0.5 and v + dv < sizes[k, 0] - 0.5):
+            continue  # also where u is nan
+        start, total = k * (len(stack) // len(projections)), 0.0
+        for down in range(-1, 2):
+            for right in range(-1, 2):
+                x, y = u - 0.5 + right * uu + down * uv, v - 0.5 + right * vu + down * vv
+                j, i = int(x), int(y)
+                a, b, four = x - j, y - i, stack[start + i * stride + j]
+                upper = (1.0 - a) * np.float64(four & 255) + a * np.float64((four >> 8) & 255)
+                lower = (1.0 - a) * np.float64((four >> 16) & 255) + a * np.float64(four >> 24)
+                gray = (1.0 - b) * upper + b * lower
+                total += min(abs(gray - np.float64(image[row + down, col + right])), WORST_GRAY)
+        costs[count] = total / (9.0 * NOISE_GRAY)
+        count += 1
+    if count == 0:
+        return np.nan
+    better = np.sort(costs[:count])[: (count + 1) // 2]
+    return float(better.mean())
 
 
 @kernel
-def _slope(values: NDArray[np.float32], row: int, col: int, down: int, across: int) -> float:
-    """Return the change of values from a pixel to the next in a direction: the smaller of both sides', not a jump."""
-    height, width = values.shape
-    i, j, k, m = row + down, col + across, row - down, col - across
-    ahead = values[i, j] - values[row, col] if i < height and j < width else np.inf
-    before = values[row, col] - values[k, m] if k >= 0 and m >= 0 else np.inf
-    least = ahead if abs(ahead) < abs(before) else before
-    return float(least) if np.isfinite(least) else 0.0
+def _gray_odds(  # noqa: PLR0913
+    image: GrayImage, planes: PlaneArray, empty: BoolArray, rim: BoolArray, row: int, col: int, near: FloatArray,
+    far: FloatArray,
+) -> float:  # fmt: skip
+    """Return the logarithm of the odds of a gray behind the outline to before it; nan where too few pixels tell.
+
+    The rim of the object does not count: it may be of what lies behind. A thin object has nothing else.
+    """
+    height, width = image.shape
+    middle = np.int64(image[row, col])
+    behind, before, edge = np.zeros(2), np.zeros(2), np.zeros(2)  # numbers of pixels, and sums of likelihoods
+    for i in range(max(row - AROUND_PX, 0), min(row + AROUND_PX + 1, height)):
+        for j in range(max(col - AROUND_PX, 0), min(col + AROUND_PX + 1, width)):
+            down, right, q = i - row, j - col, planes[i, j, 0]
+            if q > 0.0:
+                off = abs(q - (near[0] + near[1] * right + near[2] * down))
+                off_far = abs(q - (far[0] + far[1] * right + far[2] * down))
+                if min(off, off_far) > BEHIND * near[0]:
+                    continue
+                side = (edge if rim[i, j] else before) if off < off_far else behind
+            elif empty[i, j] and far[0] == 0.0:
+                side = behind
+            else:
+                continue
+            side[0] += 1.0
+            side[1] += ALIKE[abs(np.int64(image[i, j]) - middle)]
+    if before[0] < LEAST_PIXELS:
+        before += edge
+    if min(before[0], behind[0]) < LEAST_PIXELS:
+        return np.nan
+    odds = (behind[1] + UNIFORM) / (behind[0] + 1.0) * (before[0] + 1.0) / (before[1] + UNIFORM)
+    return float(np.log(odds))

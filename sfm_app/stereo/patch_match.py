@@ -13,12 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.jit import kernel, summing_kernel
+from sfm_app.jit import inlined_kernel, kernel, summing_kernel
 from sfm_app.stereo.view import GrayImage, View
-from sfm_app.types.arrays import DepthArray, FloatArray
+from sfm_app.types.arrays import DepthArray, FloatArray, IndexArray
 
 PlaneArray = NDArray[np.float32]
 """(H, W, 3): inverse depth q and its slopes, q + qu du + qv dv at (du, dv) pixels away; q = 0 where unknown."""
+
+PhotoStack = tuple[NDArray[np.uint32], int, IndexArray, FloatArray]
+"""Photos, (N H W) with a byte each of a pixel, its right neighbor and the two below; the width W; their sizes (N, 2),
+and the projections (N, 3, 4) of pixels into them."""
 
 REACH = 2
 STRIDE_PX = 2
@@ -68,6 +72,15 @@ def improve_planes(
     averaged over the better half of the photos, because the others may be occluded. Weights in the window fall with the
     distance and with the difference in gray from the center. Returns the cost (H, W) in [0, 2]; 2 where unknown.
     """
+    near = np.exp(-0.5 * (STEPS[:, None] ** 2 + STEPS**2) / OPTIONS.sigma_px**2)
+    alike = np.exp(-np.arange(256) / OPTIONS.falloff_gray)
+    cost = np.full(image.shape, NO_MATCH, np.float32)
+    _sweep(image, (near, alike), stack_photos(view, others), planes, cost)
+    return cost
+
+
+def stack_photos(view: View, others: Sequence[tuple[View, GrayImage]]) -> PhotoStack:
+    """Return photos for kernels; the projections are those of `View.projection_into`."""
     height, width = (max(photo.shape[side] for _, photo in others) for side in (0, 1))
     stack = np.zeros((len(others), height, width), np.uint32)
     projections, sizes = np.empty((len(others), 3, 4)), np.empty((len(others), 2), np.int64)
@@ -77,11 +90,7 @@ def improve_planes(
         stack[k, : photo.shape[0] - 1, : photo.shape[1] - 1] = packed
         sizes[k] = photo.shape
         projections[k] = view.projection_into(other)
-    near = np.exp(-0.5 * (STEPS[:, None] ** 2 + STEPS**2) / OPTIONS.sigma_px**2)
-    alike = np.exp(-np.arange(256) / OPTIONS.falloff_gray)
-    cost = np.full(image.shape, NO_MATCH, np.float32)
-    _sweep(image, (near, alike), (stack.ravel(), width, sizes, projections), planes, cost)
-    return cost
+    return stack.ravel(), width, sizes, projections
 
 
 @kernel
@@ -192,21 +201,12 @@ def _try_plane(  # noqa: PLR0913
 @kernel
 def _cost(row: int, col: int, plane: FloatArray, window: Any, others: Any, costs: FloatArray) -> float:
     stack, stride, sizes, projections = others
-    x, y, q = col + 0.5, row + 0.5, plane[0]
+    x, y = col + 0.5, row + 0.5
     count = 0
     for k in range(len(projections)):
-        P = projections[k]
-        w = P[2, 0] * x + P[2, 1] * y + P[2, 2] + P[2, 3] * q
-        if w <= 0:
+        u, v, uu, uv, vu, vv = warp(projections[k], x, y, plane)
+        if np.isnan(u):
             continue
-        u = (P[0, 0] * x + P[0, 1] * y + P[0, 2] + P[0, 3] * q) / w
-        v = (P[1, 0] * x + P[1, 1] * y + P[1, 2] + P[1, 3] * q) / w
-        # within a window the plane's homography is nearly affine
-        wu, wv = P[2, 0] + P[2, 3] * plane[1], P[2, 1] + P[2, 3] * plane[2]
-        uu = (P[0, 0] + P[0, 3] * plane[1] - u * wu) / w
-        uv = (P[0, 1] + P[0, 3] * plane[2] - u * wv) / w
-        vu = (P[1, 0] + P[1, 3] * plane[1] - v * wu) / w
-        vv = (P[1, 1] + P[1, 3] * plane[2] - v * wv) / w
         u, v = u - 0.5, v - 0.5
         du, dv = BORDER * (abs(uu) + abs(uv)), BORDER * (abs(vu) + abs(vv))
         inside = u - du >= 0 and v - dv >= 0 and u + du < sizes[k, 1] - 1 and v + dv < sizes[k, 0] - 1
@@ -228,6 +228,24 @@ def _cost(row: int, col: int, plane: FloatArray, window: Any, others: Any, costs
     for k in range(used):
         total += costs[k]
     return total / used
+
+
+@inlined_kernel
+def warp(P: FloatArray, x: float, y: float, plane: FloatArray) -> tuple[float, float, float, float, float, float]:
+    """Return the image (u, v) of a pixel by its plane, and du/dx, du/dy, dv/dx, dv/dy; u is nan behind the camera."""
+    q = plane[0]
+    w = P[2, 0] * x + P[2, 1] * y + P[2, 2] + P[2, 3] * q
+    if w <= 0:
+        return np.nan, np.nan, 0.0, 0.0, 0.0, 0.0
+    u = (P[0, 0] * x + P[0, 1] * y + P[0, 2] + P[0, 3] * q) / w
+    v = (P[1, 0] * x + P[1, 1] * y + P[1, 2] + P[1, 3] * q) / w
+    # within a window the plane's homography is nearly affine
+    wu, wv = P[2, 0] + P[2, 3] * plane[1], P[2, 1] + P[2, 3] * plane[2]
+    uu = (P[0, 0] + P[0, 3] * plane[1] - u * wu) / w
+    uv = (P[0, 1] + P[0, 3] * plane[2] - u * wv) / w
+    vu = (P[1, 0] + P[1, 3] * plane[1] - v * wu) / w
+    vv = (P[1, 1] + P[1, 3] * plane[2] - v * wv) / w
+    return u, v, uu, uv, vu, vv
 
 
 @summing_kernel
@@ -282,6 +300,18 @@ def plane_normals(planes: PlaneArray, view: View) -> NDArray[np.float32]:
     normals = np.zeros_like(planes)
     normals[row, col] = -n / np.linalg.norm(n, axis=1, keepdims=True)
     return normals
+
+
+def planes_of(depth: DepthArray, normals: NDArray[np.float32], view: View) -> PlaneArray:
+    """Return the planes (H, W, 3) with these depths (H, W) and normals: `plane_normals` reversed."""
+    planes = np.zeros((*depth.shape, 3), np.float32)
+    row, col = np.nonzero(depth > 0)
+    slopes = normals[row, col].astype(np.float64) @ np.linalg.inv(view.K)
+    along = slopes[:, 0] * (col + view.sample_px) + slopes[:, 1] * (row + view.sample_px) + slopes[:, 2]
+    planes[row, col, 0] = q = 1.0 / depth[row, col].astype(np.float64)
+    scale = np.divide(q, along, out=np.zeros_like(q), where=along != 0.0)
+    planes[row, col, 1:] = scale[:, None] * slopes[:, :2]
+    return planes
 
 
 @kernel
