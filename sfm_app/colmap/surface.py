@@ -10,19 +10,33 @@ from numpy.typing import NDArray
 from sfm_app.colmap import tasks
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.worker_process import run_worker
+from sfm_app.jit import kernel
 from sfm_app.types import Surface
-from sfm_app.types.arrays import ByteArray, FloatArray
+from sfm_app.types.arrays import ByteArray, FloatArray, IndexArray
 
 FUSED = "fused.ply"
 
 
-def fuse(dense_dir: Path, min_views: int, box: FloatArray, target: Path, cache_gb: float = 0.0) -> None:
-    """Fuse the geometric maps of a dense workspace, with points within a box (2, 3), into the PLY file `target`.
+def fuse(dense_dir: Path, target: Path, cache_gb: float = 0.0) -> IndexArray:
+    """Fuse the geometric maps of a dense workspace into the PLY file `target`; return (N,) photos of each point.
 
     The cache of maps has `cache_gb`: the less, the more often they are read. 0 holds all, in half the time.
     """
-    run_worker(partial(tasks.fuse, dense_dir, min_views, box, target, cache_gb), "fusing depth maps")
-    target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # photos of each point; not used
+    run_worker(partial(tasks.fuse, dense_dir, target, cache_gb), "fusing depth maps")
+    lists = target.with_name(f"{target.name}.vis")  # the number of points; for each, the number of photos and these
+    with translate_errors(f"reading {lists.name}"):
+        seen = np.zeros(int(np.fromfile(lists, "<u8", 1)[0]), np.int64)
+        _count_photos(np.fromfile(lists, "<u4", offset=8), seen)
+    lists.unlink()
+    return seen
+
+
+@kernel
+def _count_photos(lists: NDArray[np.uint32], seen: IndexArray) -> None:
+    at = 0
+    for point in range(len(seen)):
+        seen[point] = lists[at]
+        at += 1 + seen[point]
 
 
 def open_points(path: Path) -> NDArray[np.void]:

@@ -92,14 +92,12 @@ def undistort(
 # threads, and where cores are shared they are many times slower.
 
 
-def fuse(dense_dir: Path, min_views: int, box: FloatArray, target: Path, cache_gb: float) -> None:
-    """Fuse the depth maps of a dense workspace into points."""
+def fuse(dense_dir: Path, target: Path, cache_gb: float) -> None:
+    """Fuse the depth maps of a dense workspace into points, also those of one photo."""
     options = pycolmap.StereoFusionOptions()
-    options.min_num_pixels = min_views
+    options.min_num_pixels = 1
     # our depths are checked already, and normals from disparities are noisier than those of COLMAP's PatchMatch
     options.max_normal_error = 25.0
-    low, high = box.astype(np.float32)
-    options.bounding_box = (low, high)
     options.use_cache = cache_gb > 0.0  # else all maps are in memory at once, which takes half the time
     options.cache_size = cache_gb or options.cache_size
     options.num_threads = 1

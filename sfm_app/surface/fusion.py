@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.dense import map_file, normals_file, read_depth, write_depth, write_fusion_views
-from sfm_app.colmap.surface import fuse, open_points, write_points
+from sfm_app.colmap.surface import fuse, open_points, positions, write_points
 from sfm_app.files import fingerprint, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.meshing.blocks import split_points
+from sfm_app.meshing.refinement import finest_pixels
+from sfm_app.meshing.tetrahedra import OPTIONS
 from sfm_app.operating_system import share_bytes
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import FUSED_AT_ONCE_MP, MAPS_MB_PER_MP, cache_gb
@@ -31,6 +33,9 @@ STRIDE = 16
 BEYOND = 0.03
 """Largest distance of a pixel from a block, as a share of its depth: three times COLMAP's tolerance of the depths of a
 point."""
+LONE = 3.0
+"""Distance of a point that too few photos see from all others, in distances of points: nearer, it is their noise. Chosen
+by hand."""
 FUSING = "fusing"
 """Folder beside the points while they are fused."""
 
@@ -61,7 +66,7 @@ def fuse_maps(dense_dir: Path, views: Sequence[View], min_views: int, target: Pa
     pixels = sum(view.width * view.height for view in views)
     if pixels <= MOST_PIXELS:
         with run.step("fusing depth maps"), replace_atomically(target) as path:
-            fuse(dense_dir, min_views, region(views), path, _cache_gb(views, cache_gb(run.memory_mb)))
+            fuse_points(dense_dir, views, min_views, region(views), path, cache_gb(run.memory_mb))
         return
     folder = target.parent / FUSING
     stamps = [[view.name, map_file(dense_dir, view).stat().st_mtime_ns] for view in views]
@@ -121,16 +126,34 @@ def fuse_block(task: FusionTask) -> None:
     write_fusion_views(scratch, task.views)
     with replace_atomically(task.path) as path:
         if task.views:
-            fuse(scratch, task.min_views, task.box, path, _cache_gb(task.views, task.memory_gb))
+            fuse_points(scratch, task.views, task.min_views, task.box, path, task.memory_gb)
         else:
             path.touch()
     shutil.rmtree(scratch)
 
 
-def _cache_gb(views: Sequence[View], memory_gb: float) -> float:
-    """Return the size of fusion's cache, 0 where memory holds all maps."""
+def fuse_points(  # noqa: PLR0913
+    dense_dir: Path, views: Sequence[View], min_views: int, box: FloatArray, target: Path, memory_gb: float
+) -> None:
+    """Fuse maps into the points of a box (2, 3) that enough photos see, and others where there are none of these.
+
+    The edge of a thing, or what it half hides, may be in one photo only; elsewhere such a point is noise.
+    """
+    from scipy.spatial import cKDTree
+
+    everything = target.with_name(f"{target.name}.all")
     needed_mb = MAPS_MB_PER_MP * sum(view.width * view.height for view in views) / 1e6
-    return memory_gb if needed_mb > 1000 * memory_gb else 0.0
+    seen = fuse(dense_dir, everything, memory_gb if needed_mb > 1000 * memory_gb else 0.0)
+    records = open_points(everything)
+    places = positions(records)
+    keep = seen >= min_views
+    lone = np.flatnonzero(~keep)
+    gap = cKDTree(places[keep]).query(places[lone])[0]
+    keep[lone] = gap > LONE * OPTIONS.spacing_px * finest_pixels(places[lone], views)
+    keep &= ((places >= box[0]) & (places <= box[1])).all(axis=1)
+    write_points([records[keep]], target)
+    del records  # unmaps the file
+    everything.unlink()
 
 
 def sample_points(dense_dir: Path, view: View) -> FloatArray:

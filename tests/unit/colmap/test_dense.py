@@ -1,6 +1,7 @@
 """The dense workspace: views, maps, masks, fusion and surfaces."""
 
 import pickle
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from scipy.spatial import cKDTree
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import (
@@ -29,6 +31,7 @@ from sfm_app.errors import BackendError
 from sfm_app.photos.masks import save_mask
 from sfm_app.progress import Progress
 from sfm_app.stereo import DepthEstimate, DepthMap
+from sfm_app.surface.fusion import fuse_points
 from sfm_app.tasks import Shared
 from sfm_app.types import Surface
 
@@ -90,10 +93,13 @@ def test_views_are_those_of_the_model(workspace):
 def test_fused_points_lie_on_the_plane_and_face_the_cameras(workspace):
     dense, _ = workspace
 
-    fuse(dense, 3, BOX, dense / FUSED)
-    fuse(dense, 3, BOX, dense / "cached.ply", cache_gb=0.25)
+    seen = fuse(dense, dense / FUSED)
+    np.testing.assert_array_equal(fuse(dense, dense / "cached.ply", cache_gb=0.25), seen)
     records = open_points(dense / FUSED)
     assert (dense / "cached.ply").read_bytes() == (dense / FUSED).read_bytes()
+    assert len(seen) == len(records)
+    assert set(seen) == {1, 2, 3}
+    records = records[seen == 3]
     points, normals = positions(records), np.stack([records[c] for c in ("nx", "ny", "nz")], axis=1)
 
     assert 1000 < len(points) < 120 * 90
@@ -153,9 +159,32 @@ def test_a_map_appears_complete_or_not_at_all(workspace, monkeypatch):
 
 
 def test_the_box_cuts_the_points(workspace):
-    dense, _ = workspace
-    fuse(dense, 2, np.array([[0.0, -50, -50], [50, 50, 50]]), dense / FUSED)
+    dense, views = workspace
+    fuse_points(dense, views, 2, np.array([[0.0, -50, -50], [50, 50, 50]]), dense / FUSED, 1.0)
     assert positions(open_points(dense / FUSED))[:, 0].min() >= 0
+
+
+def test_points_of_one_photo_remain_where_no_others_are(workspace, tmp_path):
+    dense, views = shutil.copytree(workspace[0], tmp_path / "dense"), workspace[1]
+    for view in views[1:]:  # the left half is now in one photo only
+        maps = DenseStore(dense).read_maps(view)
+        maps.depth[:, :60] = 0
+        DenseStore(dense).write_maps(view, maps)
+    seen = fuse(dense, dense / FUSED)
+    everything = open_points(dense / FUSED)
+    sure, lone = everything[seen >= 2], everything[seen == 1]
+    gaps, _ = cKDTree(positions(sure)).query(positions(lone))
+    near = 5 * DISTANCE / 110
+
+    fuse_points(dense, views, 2, BOX, dense / "chosen.ply", 1.0)
+    chosen = {point.tobytes() for point in open_points(dense / "chosen.ply")}
+
+    assert all(point.tobytes() in chosen for point in sure)
+    assert np.count_nonzero(gaps > 3 * near) > 1000
+    kept = [point.tobytes() in chosen for point in lone[gaps > 3 * near]]
+    assert np.mean(kept) > 0.96  # all but those on the border of the photo
+    assert np.count_nonzero(gaps < near) > 100
+    assert not any(point.tobytes() in chosen for point in lone[gaps < near])
 
 
 def wavy(size: int) -> Surface:
@@ -307,7 +336,7 @@ def test_nothing_is_fused_from_what_is_masked(dense):
     np.testing.assert_array_equal(read_depth(folder, view, "geometric"), np.where(used, 4, np.float32(MASKED)))
 
     write_fusion_views(folder, [view])
-    fuse(folder, 1, np.array([[-50.0] * 3, [50.0] * 3]), folder / FUSED)
+    fuse(folder, folder / FUSED)
     points = positions(open_points(folder / FUSED))
 
     at = (points @ view.R.T + view.t) @ view.K.T
