@@ -53,11 +53,6 @@ def undistort_mask(cameras: Shared[Mapping[str, Camera]], mask_dir: Path, dense_
     save_mask(dense_dir / MASKS, view.name, shown)
 
 
-def has_masks(dense_dir: Path) -> bool:
-    """Return whether any undistorted photo has a mask."""
-    return (dense_dir / MASKS).is_dir()
-
-
 def used_pixels(dense_dir: Path, view: View) -> BoolArray | None:
     """Return the mask (H, W) of an undistorted photo, true where pixels may be used; None without mask."""
     place = dense_dir / MASKS
@@ -180,16 +175,16 @@ class DenseStore:
         _write_depth_format(self.dense_dir, CONFIDENCES, view, estimate.confidence, "photometric")
         _write_depth_format(self.dense_dir, DEPTHS, view, estimate.depth, "photometric")
 
-    def write_maps(self, view: View, maps: DepthMap) -> None:
+    def write_maps(self, view: View, maps: DepthMap, kind: Kind = "geometric") -> None:
         """Write the confirmed depths (H, W) and the normals (H, W, 3) of a view, as COLMAP's fusion expects them."""
         # pycolmap takes (H, W, 3) but stores the bytes unchanged, while COLMAP keeps x, y and z in planes.
         planes = np.ascontiguousarray(maps.normals.transpose(2, 0, 1)).reshape(maps.normals.shape)
         with (
             translate_errors(f"writing the normal map of {view.name}"),
-            _atomic_path(normals_file(self.dense_dir, view)) as path,
+            _atomic_path(_map_path(self.dense_dir, NORMALS, view, kind)) as path,
         ):
             pycolmap.NormalMap.from_array(planes).write(path)
-        write_depth(self.dense_dir, view, maps.depth)
+        _write_depth_format(self.dense_dir, DEPTHS, view, maps.depth, kind)
 
 
 def read_depth(dense_dir: Path, view: View, kind: Kind) -> Float32Array:
@@ -202,12 +197,17 @@ def write_depth(dense_dir: Path, view: View, depth: Float32Array) -> None:
     _write_depth_format(dense_dir, DEPTHS, view, depth, "geometric")
 
 
-def mask_depths(dense_dir: Path, view: View) -> None:
-    """Write MASKED into the confirmed depths of a view where the photo is masked."""
-    used, file = used_pixels(dense_dir, view), map_file(dense_dir, view)
-    if used is not None and file.exists():
-        depth = read_depth(dense_dir, view, "geometric")
-        write_depth(dense_dir, view, np.where(used, depth, np.float32(MASKED)))
+def mask_depths(dense_dir: Path, view: View, depth: Float32Array) -> Float32Array:
+    """Return the depths (H, W) of a view with MASKED where the photo is masked."""
+    used = used_pixels(dense_dir, view)
+    return depth if used is None else np.where(used, depth, np.float32(MASKED))
+
+
+def publish_maps(dense_dir: Path, view: View) -> None:
+    """Replace the geometric maps of a view by the final ones, unless a killed run has."""
+    for folder in (NORMALS, DEPTHS):
+        if (final := _map_path(dense_dir, folder, view, "final")).exists():
+            replace_file(final, _map_path(dense_dir, folder, view, "geometric"))
 
 
 def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:

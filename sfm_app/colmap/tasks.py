@@ -3,11 +3,8 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from sfm_app.colmap.backend import check_written, largest_model, pycolmap, run_with_progress
 from sfm_app.colmap.worker_process import ProgressReporter
-from sfm_app.types.arrays import FloatArray
 
 JPEG_QUALITY = 98
 UNDISTORTED_PHOTOS = {"COLMAP": "images", "PMVS": "pmvs/visualize"}

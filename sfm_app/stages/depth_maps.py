@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
 
@@ -15,16 +16,19 @@ from sfm_app.errors import ReconstructionError
 from sfm_app.files import fingerprint, load_arrays, mark_finished, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.meshing.visibility import SKY
 from sfm_app.runtime.context import RunContext
-from sfm_app.stereo import DepthTask, View, rank_neighbors
+from sfm_app.stereo import DepthMap, DepthTask, View, rank_neighbors
+from sfm_app.stereo.outlines import sharpen_outlines
 from sfm_app.stereo.sky import PhotoAreas, blank_areas, count_votes, find_skies, sky_pixels
 from sfm_app.tasks import Shared, Task
-from sfm_app.types import Rejected, Scene
+from sfm_app.types import Scene
 from sfm_app.types.arrays import BoolArray, FloatArray
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
 
-SKIES = "skies.npz"
-"""File with each photo's cells of sky."""
+MADE = "made.npz"
+"""File with each photo's cells of sky and the reason why it has no map, written once all maps are made."""
+SHARP = "sharp"
+"""Empty file, written once every photo has its final map beside the first one."""
 
 
 def make(scene: Scene, run: RunContext) -> Path:
@@ -33,15 +37,18 @@ def make(scene: Scene, run: RunContext) -> Path:
     method, reason = run.plugins.depth_method(options.method)
     run.record(method=method.name, method_reason=reason)
     prepare(scene, dense_dir, method.name, run)
-    views = dense.read_views(dense_dir)
+    views, made = dense.read_views(dense_dir), dense_dir / MADE
     ranked = rank_neighbors(views, 2 * options.neighbors)  # twice as many confirm a map as make it
     with single_threaded_opencv():
-        rejections = method.make(DepthTask(dense_dir, views, ranked, options, dense.DenseStore(dense_dir), run.map))
-    if options.drop_sky:
-        drop_skies(dense_dir, [view for view in views if dense.map_file(dense_dir, view).exists()], run)
-    if dense.has_masks(dense_dir):
-        run.map(Task(dense.mask_depths, dense_dir), views, "masking depth maps")
-    record(dense_dir, views, rejections, run)
+        if not made.exists():  # a killed run has changed maps, and would find others now
+            task = DepthTask(dense_dir, views, ranked, options, dense.DenseStore(dense_dir), run.map)
+            reasons = ["" if rejection is None else rejection.reason for rejection in method.make(task)]
+            skies = detect_skies(dense_dir, views, run) if options.drop_sky else {}
+            with replace_atomically(made) as path:
+                np.savez(path, allow_pickle=False, reasons=np.array(reasons, np.str_), **skies)
+        found = load_arrays(made)
+        finish(dense_dir, Finishing(views, [near[: options.neighbors] for near in ranked], found), run)
+    record(dense_dir, views, found["reasons"].tolist(), run)
     dense.drop_estimates(dense_dir, views)
     dense.write_fusion_views(dense_dir, views)
     mark_finished(dense_dir)
@@ -76,23 +83,20 @@ def _project_wide_photo(
     write_views(name, lenses.value[camera_id], photo_dir, mask_dir, dense_dir)
 
 
-def drop_skies(dense_dir: Path, views: Sequence[View], run: RunContext) -> None:
-    """Remove the depths of sky: semi-global matching continues depths along its rims. The views have a map."""
-    file = dense_dir / SKIES
-    if not file.exists():  # a killed run has removed depths by these skies, and would find others now
-        areas = run.map(Task(find_blank_areas, dense_dir), views, "detecting the sky")
-        votes = run.map(Task(_count_votes, Shared((areas, views))), range(len(views)), "comparing skies")
-        cells = {str(number): sky for number, sky in enumerate(find_skies(areas, votes))}
-        with replace_atomically(file) as path:
-            np.savez(path, allow_pickle=False, **cells)
-    skies = load_arrays(file)
-    outdoor = [(number, view) for number, view in enumerate(views) if skies[str(number)].any()]
-    shares = run.map(Task(_drop_sky, dense_dir, Shared(skies)), outdoor, "removing the sky") if outdoor else []
-    run.record(sky=round(sum(shares) / max(len(views), 1), 3))
+def detect_skies(dense_dir: Path, views: Sequence[View], run: RunContext) -> dict[str, BoolArray]:
+    """Return the cells of sky of the photos that have a map, by the number of the photo."""
+    mapped = _mapped(dense_dir, views)
+    areas = run.map(Task(_find_blank_areas, dense_dir), [views[number] for number in mapped], "detecting the sky")
+    voters = Shared((areas, [views[number] for number in mapped]))
+    votes = run.map(Task(_count_votes, voters), range(len(mapped)), "comparing skies")
+    return {str(number): sky for number, sky in zip(mapped, find_skies(areas, votes), strict=True)}
 
 
-def find_blank_areas(dense_dir: Path, view: View) -> PhotoAreas:
-    """Return the blank areas of a photo with a map."""
+def _mapped(dense_dir: Path, views: Sequence[View]) -> list[int]:
+    return [number for number, view in enumerate(views) if dense.map_file(dense_dir, view).exists()]
+
+
+def _find_blank_areas(dense_dir: Path, view: View) -> PhotoAreas:
     return blank_areas(dense.read_gray(dense_dir, view), dense.read_depth(dense_dir, view, "geometric"))
 
 
@@ -100,27 +104,56 @@ def _count_votes(photos: Shared[tuple[Sequence[PhotoAreas], Sequence[View]]], in
     return count_votes(*photos.value, index)
 
 
-def _drop_sky(dense_dir: Path, skies: Shared[Mapping[str, BoolArray]], photo: tuple[int, View]) -> float:
-    """Remove the depths of the sky of one photo, and return its share of the photo."""
-    number, view = photo
-    sky = sky_pixels(dense.read_gray(dense_dir, view), skies.value[str(number)])
-    depth = dense.read_depth(dense_dir, view, "geometric")
-    dense.write_depth(dense_dir, view, np.where(sky, np.float32(SKY), depth))
-    return float(sky.mean())
+@dataclass(frozen=True, slots=True, eq=False)
+class Finishing:
+    """Input of the final maps besides the files."""
+
+    views: Sequence[View]
+    near: Sequence[Sequence[int]]
+    """For each view, the indices of the photos that it is compared with."""
+    skies: Mapping[str, BoolArray]
+    """Cells of sky of the photos that have a map, by the number of the photo; empty if skies stay."""
 
 
-def record(dense_dir: Path, views: Sequence[View], rejections: Sequence[Rejected | None], run: RunContext) -> None:
+def finish(dense_dir: Path, task: Finishing, run: RunContext) -> None:
+    """Sharpen the outlines of all maps, and mark skies and masked pixels."""
+    if not (dense_dir / SHARP).exists():
+        run.map(Task(_finish_map, dense_dir, Shared(task)), _mapped(dense_dir, task.views), "sharpening outlines")
+        (dense_dir / SHARP).touch()
+    for view in task.views:
+        dense.publish_maps(dense_dir, view)
+
+
+def _finish_map(dense_dir: Path, shared: Shared[Finishing], number: int) -> None:
+    task, store = shared.value, dense.DenseStore(dense_dir)
+    view = task.views[number]
+    if store.has(view, "final"):
+        return
+    maps, photo = store.read_maps(view), store.photo(view)
+    # semi-global matching continues depths along the rims of skies
+    sky = sky_pixels(photo, task.skies.get(str(number), np.zeros((1, 1), np.bool_)))
+    maps = DepthMap(np.where(sky, np.float32(0), maps.depth), maps.normals)
+    others = [task.views[other] for other in task.near[number]]
+    maps = sharpen_outlines(maps, view, photo, [(other, store.photo(other)) for other in others])
+    depth = np.where(sky & (maps.depth <= 0), np.float32(SKY), maps.depth)
+    store.write_maps(view, DepthMap(dense.mask_depths(dense_dir, view, depth), maps.normals), "final")
+    dense.drop_estimates(dense_dir, [view])
+
+
+def record(dense_dir: Path, views: Sequence[View], reasons: Sequence[str], run: RunContext) -> None:
     """Record the photos' shares of depths and the reasons for missing maps; ReconstructionError if there is no map."""
-    rejected = Counter(rejection.reason for rejection in rejections if rejection is not None)
-    coverage = {
-        view.name: round(float(np.mean(dense.read_depth(dense_dir, view, "geometric") > 0)), 3)
-        for view, rejection in zip(views, rejections, strict=True)
-        if rejection is None
-    }
+    rejected, coverage, skies = Counter(reason for reason in reasons if reason), dict[str, float](), list[float]()
+    for view, reason in zip(views, reasons, strict=True):
+        if not reason:
+            depth = dense.read_depth(dense_dir, view, "geometric")
+            coverage[view.name] = round(float(np.mean(depth > 0)), 3)
+            skies.append(float(np.mean(depth == SKY)))
     run.record(depth_maps=len(coverage), rejected=dict(rejected), coverage=coverage)
     if not coverage:
         reason = rejected.most_common(1)[0][0] if rejected else "no photos"
         raise ReconstructionError(f"none of {len(views)} photos gets a depth map: {reason}", hint=HINT)
+    if run.settings.depth.drop_sky:
+        run.record(sky=round(float(np.mean(skies)), 3))
 
 
 @contextmanager

@@ -9,7 +9,6 @@ from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.settings import AS_NEEDED, DepthSettings
 from sfm_app.stereo.depth import OPTIONS as DEPTH_OPTIONS
 from sfm_app.stereo.depth import confirm_depths, match_depths
-from sfm_app.stereo.outlines import sharpen_outlines
 from sfm_app.stereo.plane_proposals import add_depths, agreed_proposals, propose_planes
 from sfm_app.stereo.sky import blank_areas, near_pixels
 from sfm_app.stereo.view import DepthEstimate, DepthMap, DepthStore, DepthTask, GrayImage, View
@@ -96,7 +95,7 @@ def _match(inputs: Shared[_Inputs], level: int, index: int) -> Rejected | None:
 
 
 def _confirm(inputs: Shared[_Inputs], usable: BoolArray, index: int) -> Rejected | None:
-    """Keep the confirmed depths of a photo, fill gaps from coarser levels, and sharpen outlines."""
+    """Keep the confirmed depths of a photo, and fill gaps from coarser levels."""
     task = inputs.value
     view = task.levels[0][index]
     if task.store.has(view, "geometric"):
@@ -111,9 +110,7 @@ def _confirm(inputs: Shared[_Inputs], usable: BoolArray, index: int) -> Rejected
             maps = fill_from_coarse(fine, view, coarse, task.levels[level][index], near_pixels(blank, fine.depth.shape))
     if isinstance(maps, Rejected):
         return maps
-    others = [task.levels[0][other] for other in task.ranked[index][: task.options.neighbors]]
-    photos = [(other, task.store.photo(other)) for other in others]
-    task.store.write_maps(view, sharpen_outlines(maps, view, task.store.photo(view), photos))
+    task.store.write_maps(view, maps)
     return None
 
 

@@ -81,7 +81,7 @@ def improve_planes(
 
 def stack_photos(view: View, others: Sequence[tuple[View, GrayImage]]) -> PhotoStack:
     """Return photos for kernels; the projections are those of `View.projection_into`."""
-    height, width = (max(photo.shape[side] for _, photo in others) for side in (0, 1))
+    height, width = (max((photo.shape[side] for _, photo in others), default=2) for side in (0, 1))
     stack = np.zeros((len(others), height, width), np.uint32)
     projections, sizes = np.empty((len(others), 3, 4)), np.empty((len(others), 2), np.int64)
     for k, (other, photo) in enumerate(others):

@@ -16,8 +16,9 @@ from sfm_app.types.arrays import DepthArray, FloatArray, IndexArray
 
 GrayImage = NDArray[np.uint8]
 """(H, W)."""
-Kind = Literal["photometric", "geometric", "proposed"]
-"""COLMAP's names for a depth map before and after the check against the other photos; and proposals for plain areas."""
+Kind = Literal["photometric", "geometric", "proposed", "final"]
+"""COLMAP's names for a depth map before and after the check against the other photos; proposals for plain areas; and
+maps with sharp outlines before they replace the geometric ones."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,8 +34,8 @@ BEYOND = 0.03
 """Largest distance of a pixel from a block, as a share of its depth: three times COLMAP's tolerance of the depths of a
 point."""
 LONE = 3.0
-"""Distance of a point that too few photos see from all others, in distances of points: nearer, it is their noise. Chosen
-by hand."""
+"""Distance of a point that too few photos see from all others, in distances of points: a nearer one is noise. Chosen by
+hand."""
 FUSING = "fusing"
 """Folder beside the points while they are fused."""
 
@@ -132,7 +132,7 @@ def fuse_block(task: FusionTask) -> None:
     shutil.rmtree(scratch)
 
 
-def fuse_points(  # noqa: PLR0913
+def fuse_points(
     dense_dir: Path, views: Sequence[View], min_views: int, box: FloatArray, target: Path, memory_gb: float
 ) -> None:
     """Fuse maps into the points of a box (2, 3) that enough photos see, and others where there are none of these.

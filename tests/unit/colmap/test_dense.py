@@ -18,6 +18,7 @@ from sfm_app.colmap.dense import (
     cameras_of_photos,
     drop_estimates,
     mask_depths,
+    publish_maps,
     read_depth,
     read_gray,
     read_views,
@@ -299,10 +300,8 @@ def test_without_masks_all_is_used(place, tmp_path):
     depth = np.full((view.height, view.width), 3.0, np.float32)
     assert used_pixels(tmp_path, view) is None
     DenseStore(tmp_path).write_estimate(view, DepthEstimate(depth, depth / 4))
-    DenseStore(tmp_path).write_maps(view, DepthMap(depth, np.zeros((*depth.shape, 3), np.float32)))
-    mask_depths(tmp_path, view)
     assert (DenseStore(tmp_path).read_estimate(view).depth == 3).all()
-    assert (read_depth(tmp_path, view, "geometric") == 3).all()
+    assert (mask_depths(tmp_path, view, depth) == 3).all()
 
 
 def test_estimates_have_no_depth_where_the_photo_is_masked(dense):
@@ -328,9 +327,10 @@ def test_nothing_is_fused_from_what_is_masked(dense):
     normals = np.zeros((*used_pixels(folder, views["1.png"]).shape, 3), np.float32)
     normals[..., 2] = -1
     for view in views.values():
-        DenseStore(folder).write_maps(view, DepthMap(np.full(normals.shape[:2], 4.0, np.float32), normals))
-        mask_depths(folder, view)
-        mask_depths(folder, view)  # a killed run does it twice
+        depth = mask_depths(folder, view, np.full(normals.shape[:2], 4.0, np.float32))
+        DenseStore(folder).write_maps(view, DepthMap(depth, normals), "final")
+        publish_maps(folder, view)
+        publish_maps(folder, view)  # a killed run does it twice
     view = views["1.png"]
     used = used_pixels(folder, view)
     np.testing.assert_array_equal(read_depth(folder, view, "geometric"), np.where(used, 4, np.float32(MASKED)))
