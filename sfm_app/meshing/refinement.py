@@ -6,12 +6,13 @@ from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from threading import Lock
 
+import cv2
 import numpy as np
 
 from sfm_app.geometry.poses import normalize
 from sfm_app.geometry.raster import NOTHING, project_vertices, rasterize
 from sfm_app.geometry.triangles import morton_order, unique_edges, vertex_normals
-from sfm_app.meshing.agreement import Pull, RefinePhoto, Sight, compare
+from sfm_app.meshing.agreement import REACH, Pull, RefinePhoto, Sight, compare
 from sfm_app.meshing.fairness import Neighbors, find_displacements
 from sfm_app.tasks import Spread
 from sfm_app.types import PosedPhoto, Surface
@@ -36,6 +37,8 @@ class RefineOptions:
     longest_step_px: float = 1.0
     """Longest step of a vertex in pixels of the closest photo: photos are smooth over about that. By definition of the
     blur."""
+    behind: float = 0.05
+    """Relative difference in depth beyond which a place lies behind another within a window. Chosen by hand."""
     longest_step_edges: float = 0.5
     """Longest step of a vertex in edges: triangles do not turn over. By definition."""
 
@@ -163,12 +166,20 @@ def _improve(
 
 
 def look(surface: Surface, photo: RefinePhoto, share: float) -> Sight:
-    """Return a photo at a share of its resolution, and the surface in it; NOTHING where the photo is masked."""
+    """Return a photo at a share of its resolution, and the surface in it.
+
+    It shows NOTHING where the photo is masked, and where a window would reach over an outline to what hides the place:
+    the outline is inexact, and the object would draw what lies behind towards itself.
+    """
     posed = photo.posed_at(share)
     size = posed.width, posed.height
     raster, masked = rasterize(surface.vertices, surface.faces, posed), photo.mask_at(size)
+    window = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
+    nearest = cv2.erode(raster.depth, window, borderType=cv2.BORDER_REPLICATE)
+    unused = raster.depth > (1.0 + OPTIONS.behind) * nearest
     if masked is not None:
-        raster.depth[masked], raster.face[masked] = np.inf, NOTHING
+        unused |= masked
+    raster.depth[unused], raster.face[unused] = np.inf, NOTHING
     return Sight(posed, photo.image_at(size), raster)
 
 

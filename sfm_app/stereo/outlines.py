@@ -83,8 +83,7 @@ def _choose(
             if not abs(odds) > SURE:  # also where it is nan
                 continue
             plane, own = far if odds > 0.0 else near, planes[row, col, 0]
-            # windows spread the surface in front: a pixel behind is right
-            if own == 0.0 or own > (1.0 + SAME) * plane[0]:
+            if own == 0.0 or abs(own - plane[0]) > SAME * plane[0]:
                 changed[row, col] = True
                 for c in range(3):
                     chosen[row, col, c] = plane[c]

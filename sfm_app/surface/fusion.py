@@ -137,7 +137,8 @@ def fuse_points(
 ) -> None:
     """Fuse maps into the points of a box (2, 3) that enough photos see, and others where there are none of these.
 
-    The edge of a thing, or what it half hides, may be in one photo only; elsewhere such a point is noise.
+    The edge of a thing, or what it half hides, may be in one photo only; elsewhere such a point is noise. If most points
+    are of that kind, the maps do not agree, and none of it counts.
     """
     from scipy.spatial import cKDTree
 
@@ -149,7 +150,8 @@ def fuse_points(
     keep = seen >= min_views
     lone = np.flatnonzero(~keep)
     gap = cKDTree(places[keep]).query(places[lone])[0]
-    keep[lone] = gap > LONE * OPTIONS.spacing_px * finest_pixels(places[lone], views)
+    lone = lone[gap > LONE * OPTIONS.spacing_px * finest_pixels(places[lone], views)]
+    keep[lone] = len(lone) < np.count_nonzero(keep)
     keep &= ((places >= box[0]) & (places <= box[1])).all(axis=1)
     write_points([records[keep]], target)
     del records  # unmaps the file

@@ -13,7 +13,7 @@ from sfm_app.meshing.agreement import Sight, compare
 from sfm_app.meshing.refinement import Sights, finest_pixels, look, refine, split_long_edges
 from sfm_app.synthetic.shapes import ball
 from sfm_app.types import Surface
-from tests.unit.meshing.relief import PIXEL, SIDE, grid, relief
+from tests.unit.meshing.relief import PIXEL, SIDE, gray_at, grid, relief
 
 BUMP_PX, WIDTH_PX = 3.0, 12.0
 
@@ -88,6 +88,32 @@ def test_what_is_masked_says_nothing():
     left, right = (x < -0.15) & (np.abs(y) < 0.2), (x > 0.15) & (x < 0.25) & (np.abs(y) < 0.2)
     assert np.abs(z[left]).max() < 0.3 * PIXEL, "nothing pulls there"
     assert (z - bumps(x, y))[right].std() < 0.4 * bumps(x, y)[right].std()
+
+
+def test_an_object_with_an_inexact_outline_does_not_draw_what_lies_behind():
+    """A textured bar before a plain wall; the surface has the wall, and the bar two pixels too narrow."""
+    height, half = 0.3, 0.1
+    scene, photos = relief(flat), []
+    for photo in scene.photos:
+        posed = photo.posed
+        v, u = np.indices(photo.gray.shape) + 0.5
+        rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(posed.projection[:, :3]).T
+        place = posed.center + rays * ((height - posed.center[2]) / rays[..., 2:])
+        gray = np.where(np.abs(place[..., 0]) < half, 0.5 * gray_at(place[..., 0], place[..., 1]), 150)
+        photos.append(replace(photo, gray=gray.clip(0, 255).astype(np.uint8)))
+    wall, bar = grid(flat), grid(lambda x, y: 0.0 * x + height, half - 2.0 * PIXEL)
+    count = len(wall.vertices)
+    both = Surface(
+        np.concatenate([wall.vertices, bar.vertices * [1.0, 4.0, 1.0]]),
+        np.concatenate([wall.faces, bar.faces + count]), np.concatenate([wall.colors, bar.colors]),
+    )  # fmt: skip
+
+    found = refine(both, photos, scene.partners, 1).surface  # no triangle is divided
+
+    at_wall = found.vertices[:, 2] < 0.5 * height
+    assert np.count_nonzero(at_wall) == count
+    assert np.abs(found.vertices[at_wall, 2]).max() < 0.2 * PIXEL
+    assert np.abs(found.vertices[~at_wall, 2] - height).mean() < 0.5 * PIXEL
 
 
 def test_photos_without_texture_change_nothing_but_roughness():

@@ -86,16 +86,6 @@ def test_depths_that_cross_an_outline_return_to_their_surface(scene, views, disc
     assert cosine.min() > 0.99
 
 
-def test_pixels_behind_stay_behind(scene, views):
-    one, view = scene(), views[1]
-    given_maps = one.maps(view, -4)
-
-    found = one.sharpen(view, given_maps, views[:1] + views[2:])
-
-    on_wall = ~one.on_disc(view, -4)
-    np.testing.assert_array_equal(found.depth[on_wall], given_maps.depth[on_wall])
-
-
 @pytest.mark.parametrize("sample_px", [0.0, 0.5])
 def test_unknown_depths_at_an_outline_are_filled(scene, make_view, views, sample_px):
     one, view = scene(), make_view(CENTERS[1], sample_px=sample_px)
