@@ -137,8 +137,8 @@ def fuse_points(
 ) -> None:
     """Fuse maps into the points of a box (2, 3) that enough photos see, and others where there are none of these.
 
-    The edge of a thing, or what it half hides, may be in one photo only; elsewhere such a point is noise. If most points
-    are of that kind, the maps do not agree, and none of it counts.
+    What a thing half hides may be in one photo only; elsewhere such a point is noise. If most points are of that kind,
+    the maps do not agree, and none of them remains.
     """
     from scipy.spatial import cKDTree
 
