@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sfm_app.colmap import dense
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import MASKED, DenseStore, read_depth, read_views
 from sfm_app.errors import ConfigError, ReconstructionError
@@ -123,20 +124,27 @@ def test_depths_in_the_sky_are_removed_unless_they_shall_stay(upside_down):
     assert np.mean(depth == SKY) == pytest.approx(counts["sky"], abs=0.02)
 
 
-def test_a_run_that_is_killed_while_it_removes_the_sky_finds_the_same_sky(upside_down, monkeypatch):
+@pytest.mark.parametrize(
+    ("place", "name"), [(depth_maps, "sharpen_outlines"), (dense, "publish_maps"), (depth_maps, "record")]
+)
+def test_a_run_that_is_killed_while_it_finishes_its_maps_makes_the_same(upside_down, monkeypatch, place, name):
     whole = run_stage(upside_down, Method())
-    dropped = [read_depth(upside_down.dense_dir, view, "geometric") for view in read_views(upside_down.dense_dir)]
+    finished = [read_depth(upside_down.dense_dir, view, "geometric") for view in read_views(upside_down.dense_dir)]
+    calls, original = [], getattr(place, name)
 
-    def stop(*_):
-        raise KeyboardInterrupt
+    def stop(*arguments):
+        calls.append(original(*arguments))
+        if len(calls) == 2 or name == "record":
+            raise KeyboardInterrupt
+        return calls[-1]
 
     with monkeypatch.context() as patched:
-        patched.setattr(depth_maps, "record", stop)
+        patched.setattr(place, name, stop)
         with pytest.raises(KeyboardInterrupt):
             run_stage(upside_down, Method(), "again")
 
     assert run_stage(upside_down, Method(), "again") == whole
-    for view, before in zip(read_views(upside_down.dense_dir), dropped, strict=True):
+    for view, before in zip(read_views(upside_down.dense_dir), finished, strict=True):
         np.testing.assert_array_equal(read_depth(upside_down.dense_dir, view, "geometric"), before)
 
 
