@@ -23,6 +23,7 @@ from sfm_app.operating_system import share_bytes
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import FUSED_AT_ONCE_MP, MAPS_MB_PER_MP, cache_gb
 from sfm_app.stereo import View, region
+from sfm_app.surface.spanning import GAP
 from sfm_app.tasks import Task
 from sfm_app.types.arrays import FloatArray
 
@@ -34,8 +35,8 @@ BEYOND = 0.03
 """Largest distance of a pixel from a block, as a share of its depth: three times COLMAP's tolerance of the depths of a
 point."""
 LONE = 3.0
-"""Distance of a point that too few photos see from all others, in distances of points: a nearer one is noise. Chosen by
-hand."""
+"""Least distance of a point of too few photos from all others, in distances of points: a nearer one is their noise.
+Chosen by hand. The greatest is GAP: farther points have nothing to confirm them, and open the ground of castle-P19."""
 FUSING = "fusing"
 """Folder beside the points while they are fused."""
 
@@ -135,7 +136,7 @@ def fuse_block(task: FusionTask) -> None:
 def fuse_points(
     dense_dir: Path, views: Sequence[View], min_views: int, box: FloatArray, target: Path, memory_gb: float
 ) -> None:
-    """Fuse maps into the points of a box (2, 3) that enough photos see, and others where there are none of these.
+    """Fuse maps into the points of a box (2, 3) that enough photos see, and others beside them where there are none.
 
     What a thing half hides may be in one photo only; elsewhere such a point is noise. If most points are of that kind,
     the maps do not agree, and none of them remains.
@@ -150,7 +151,8 @@ def fuse_points(
     keep = seen >= min_views
     lone = np.flatnonzero(~keep)
     gap = cKDTree(places[keep]).query(places[lone])[0]
-    lone = lone[gap > LONE * OPTIONS.spacing_px * finest_pixels(places[lone], views)]
+    gap /= OPTIONS.spacing_px * finest_pixels(places[lone], views)
+    lone = lone[(gap > LONE) & (gap < GAP)]
     keep[lone] = len(lone) < np.count_nonzero(keep)
     keep &= ((places >= box[0]) & (places <= box[1])).all(axis=1)
     write_points([records[keep]], target)

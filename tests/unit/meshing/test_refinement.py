@@ -91,7 +91,7 @@ def test_what_is_masked_says_nothing():
 
 
 def test_an_object_with_an_inexact_outline_does_not_draw_what_lies_behind():
-    """A textured bar before a plain wall; the surface has the wall, and the bar two pixels too narrow."""
+    """A textured bar before a plain wall; the surface has the wall, and the bar a pixel too narrow on each side."""
     height, half = 0.3, 0.1
     scene, photos = relief(flat), []
     for photo in scene.photos:
@@ -101,7 +101,7 @@ def test_an_object_with_an_inexact_outline_does_not_draw_what_lies_behind():
         place = posed.center + rays * ((height - posed.center[2]) / rays[..., 2:])
         gray = np.where(np.abs(place[..., 0]) < half, 0.5 * gray_at(place[..., 0], place[..., 1]), 150)
         photos.append(replace(photo, gray=gray.clip(0, 255).astype(np.uint8)))
-    wall, bar = grid(flat), grid(lambda x, y: 0.0 * (x + y) + height, half - 2.0 * PIXEL)
+    wall, bar = grid(flat), grid(lambda x, y: 0.0 * (x + y) + height, half - PIXEL)
     count = len(wall.vertices)
     both = Surface(
         np.concatenate([wall.vertices, bar.vertices * [1.0, 4.0, 1.0]]),
