@@ -26,6 +26,9 @@ BEHIND = 0.05
 `REACH_PX` where it is seen at 5 degrees."""
 SAME = 0.02
 """Relative difference of nearness within which a pixel keeps its own depth. Chosen by hand."""
+PLAIN_GRAY = 8.0
+"""Largest standard deviation of the grays of a gap that may be nothing: where matching fails in spite of texture, there
+is something. Chosen by hand."""
 LEAST_PIXELS = 5
 """Fewest pixels whose grays describe a surface."""
 NOISE_GRAY = 3.0
@@ -48,12 +51,15 @@ def sharpen_outlines(
 ) -> DepthMap:
     """Let each pixel within `REACH_PX` of an outline choose between both surfaces, also where its depth is unknown.
 
-    Behind an object may be nothing: a gap without depths that is wider than two rims.
+    Behind an object may be nothing: a plain gap without depths that is wider than two rims.
     """
     planes, known = planes_of(maps.depth, maps.normals, view), maps.depth > 0
-    empty = np.asarray(cv2.morphologyEx((~known).view(np.uint8), cv2.MORPH_OPEN, DISC)).view(np.bool_)
+    gray = image.astype(np.float32)
+    mean = cv2.blur(gray, (3, 3))
+    plain = cv2.blur(gray * gray, (3, 3)) - mean * mean <= PLAIN_GRAY**2
+    empty = np.asarray(cv2.morphologyEx((plain & ~known).view(np.uint8), cv2.MORPH_OPEN, DISC)).view(np.bool_)
     nearness = planes[..., 0]
-    lowest = cv2.erode(np.where(known | empty, nearness, np.float32(np.inf)), DISC)
+    lowest = cv2.erode(np.where(known | empty, nearness, np.float32(np.inf)), DISC, borderType=cv2.BORDER_REPLICATE)
     beside = cv2.dilate(nearness, DISC) > (1.0 + BEHIND) * lowest
     rim = known & (nearness > (1.0 + BEHIND) * lowest)
     chosen, changed = planes.copy(), np.zeros(known.shape, np.bool_)
