@@ -150,9 +150,9 @@ def fuse_points(
     places = positions(records)
     keep = seen >= min_views
     lone = np.flatnonzero(~keep)
-    gap = cKDTree(places[keep]).query(places[lone])[0]
-    gap /= OPTIONS.spacing_px * finest_pixels(places[lone], views)
-    lone = lone[(gap > LONE) & (gap < GAP)]
+    gap, _ = cKDTree(places[keep]).query(places[lone])
+    step = OPTIONS.spacing_px * finest_pixels(places[lone], views)
+    lone = lone[(gap > LONE * step) & (gap < GAP * step)]
     keep[lone] = len(lone) < np.count_nonzero(keep)
     keep &= ((places >= box[0]) & (places <= box[1])).all(axis=1)
     write_points([records[keep]], target)
