@@ -13,8 +13,8 @@ from sfm_app.types import Photo
 
 SHARE_OF_MACHINE = 0.8
 """Share of the machine's memory that a run may use without a limit. By hand."""
-FUSED_AT_ONCE_MP = 75.0
-"""Megapixels of depth maps that are fused at once; 150 double the memory and save no time."""
+FUSED_AT_ONCE_MP = 45.0
+"""Megapixels of depth maps that are fused at once, which take 3 GB; more save no time."""
 MAPS_MB_PER_MP = 28
 """Memory in MB per megapixel of depth maps. Measured."""
 REFINED_AT_ONCE_MP = 100.0
@@ -28,8 +28,8 @@ class OPTIONS:
 
     features_per_mp: int = 4500
     """Photos with little texture have fewer. Measured."""
-    fused_mb_per_mp: int = 42
-    """Memory of COLMAP's fusion with its points. Measured."""
+    fused_mb_per_mp: int = 70
+    """Memory of COLMAP's fusion with its points, also those of one photo. Measured on castle-P19."""
     points_per_mp: int = 70_000
     """Fused points: 70 000 of a walk through a town, 58 000 of fountain-P11. Measured."""
     block_mb_per_point: float = 1600 / 1e6
