@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.dense import map_file, normals_file, read_depth, write_depth, write_fusion_views
-from sfm_app.colmap.surface import fuse, open_points, positions, write_points
+from sfm_app.colmap.surface import FUSED, fuse, open_points, positions, write_points
 from sfm_app.files import fingerprint, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.meshing.blocks import split_points
 from sfm_app.meshing.refinement import finest_pixels
@@ -143,10 +143,11 @@ def fuse_points(
     """
     from scipy.spatial import cKDTree
 
-    everything = target.with_name(f"{target.name}.all")
     needed_mb = MAPS_MB_PER_MP * sum(view.width * view.height for view in views) / 1e6
-    seen = fuse(dense_dir, everything, memory_gb if needed_mb > 1000 * memory_gb else 0.0)
-    records = open_points(everything)
+    with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
+        everything = Path(scratch) / FUSED
+        seen = fuse(dense_dir, everything, memory_gb if needed_mb > 1000 * memory_gb else 0.0)
+        records = np.array(open_points(everything))  # in memory: an open file cannot be removed everywhere
     places = positions(records)
     keep = seen >= min_views
     lone = np.flatnonzero(~keep)
@@ -156,8 +157,6 @@ def fuse_points(
     keep[lone] = len(lone) < np.count_nonzero(keep)
     keep &= ((places >= box[0]) & (places <= box[1])).all(axis=1)
     write_points([records[keep]], target)
-    del records  # unmaps the file
-    everything.unlink()
 
 
 def sample_points(dense_dir: Path, view: View) -> FloatArray:

@@ -32,6 +32,7 @@ from sfm_app.errors import BackendError
 from sfm_app.photos.masks import save_mask
 from sfm_app.progress import Progress
 from sfm_app.stereo import DepthEstimate, DepthMap
+from sfm_app.surface import fusion
 from sfm_app.surface.fusion import fuse_points
 from sfm_app.tasks import Shared
 from sfm_app.types import Surface
@@ -188,6 +189,18 @@ def test_points_of_one_photo_remain_where_no_others_are(workspace, tmp_path):
     assert np.count_nonzero(beside) > 300 and np.mean(kept(lone[beside])) > 0.96  # but those on the border of the photo
     for out in (gaps < 2 * near, gaps > 14 * near):
         assert np.count_nonzero(out) > 100 and not kept(lone[out]).any()
+
+
+def test_a_fusion_that_is_stopped_leaves_nothing_behind(workspace, tmp_path, monkeypatch):
+    dense, views = workspace
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fusion, "open_points", stop)
+    with pytest.raises(KeyboardInterrupt):
+        fuse_points(dense, views, 2, BOX, tmp_path / FUSED, 1.0)
+    assert not list(tmp_path.iterdir())
 
 
 def wavy(size: int) -> Surface:
