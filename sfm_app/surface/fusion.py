@@ -138,8 +138,7 @@ def fuse_points(
 ) -> None:
     """Fuse maps into the points of a box (2, 3) that enough photos see, and others beside them where there are none.
 
-    What a thing half hides may be in one photo only; elsewhere such a point is noise. If most points are of that kind,
-    the maps do not agree, and none of them remains.
+    What a thing half hides may be in one photo only; elsewhere such a point is noise.
     """
     from scipy.spatial import cKDTree
 
@@ -153,8 +152,7 @@ def fuse_points(
     lone = np.flatnonzero(~keep)
     gap, _ = cKDTree(places[keep]).query(places[lone])
     step = OPTIONS.spacing_px * finest_pixels(places[lone], views)
-    lone = lone[(gap > LONE * step) & (gap < GAP * step)]
-    keep[lone] = len(lone) < np.count_nonzero(keep)
+    keep[lone] = (gap > LONE * step) & (gap < GAP * step)
     keep &= ((places >= box[0]) & (places <= box[1])).all(axis=1)
     write_points([records[keep]], target)
 
