@@ -46,14 +46,6 @@ class SkyOptions:
     """Distance beyond its cells within which a sky ends, in longer sides: matching extends depths as far."""
     tolerance: float = 3.0
     """Largest difference in gray levels from the surrounding sky; real skies vary by 1. Chosen on `railing`."""
-    narrow_px: int = 9
-    """Width below which an object before the sky is narrow. Chosen on `railing`."""
-    rim_px: int = 3
-    """Rim of depths of a narrow object; fewer pixels make no surface. Chosen on `railing`."""
-    bump_px: int = 1
-    """Width beside a broad object that is a ragged outline and no narrow object. Chosen on the fisheye demo."""
-    blur_px: int = 2
-    """Width of the mixed pixels beside a sky; matching gives them depths of their own. Chosen on castle-P19."""
     steady: float = 0.3
     """Added to the variance of positions in a slope fit, in squared cells: a row of cells has no slope across it."""
     least_weight: float = 1e-4
@@ -185,17 +177,12 @@ def _sky_of(areas: PhotoAreas, votes: FloatArray, large: BoolArray) -> BoolArray
 
 
 def sky_pixels(photo: GrayImage, cells: BoolArray) -> BoolArray:
-    """Mark the pixels (H, W) of the sky: near its cells (h, w), of its gray level there, or mixed with it."""
+    """Mark the pixels (H, W) of the sky: near its cells (h, w), and of its gray level there."""
     if not cells.any():
         return np.zeros(photo.shape, bool)
     expected = cv2.resize(_continue_sky(photo, cells), photo.shape[::-1])
     smooth = cv2.GaussianBlur(photo.astype(np.float32), (3, 3), 0)  # a median would swallow wires
-    sky = near_pixels(cells, photo.shape) & (np.abs(smooth - expected) <= OPTIONS.tolerance)
-    objects, window = ~sky, np.ones((OPTIONS.narrow_px, OPTIONS.narrow_px), np.uint8)
-    broad = cv2.morphologyEx(objects.view(np.uint8), cv2.MORPH_OPEN, window) > 0
-    # narrow objects before the sky, such as branches, keep their depths with a rim
-    narrow = _widen(objects & ~_widen(broad, OPTIONS.bump_px), OPTIONS.rim_px)
-    return _widen(sky, OPTIONS.blur_px) & ~narrow
+    return np.asarray(near_pixels(cells, photo.shape) & (np.abs(smooth - expected) <= OPTIONS.tolerance))
 
 
 def near_pixels(cells: BoolArray, shape: tuple[int, ...]) -> BoolArray:
@@ -223,8 +210,3 @@ def _continue_sky(photo: GrayImage, cells: BoolArray) -> NDArray[np.float32]:
 
 def _blur(values: FloatArray) -> FloatArray:
     return np.asarray(cv2.GaussianBlur(values, (0, 0), OPTIONS.reach * max(values.shape)), np.float64)
-
-
-def _widen(mask: BoolArray, pixels: int) -> BoolArray:
-    side = 2 * pixels + 1
-    return np.asarray(cv2.dilate(mask.view(np.uint8), np.ones((side, side), np.uint8)) > 0)
