@@ -5,10 +5,11 @@ pairs that hold the sides together, the least cut between them, are wrong.
 """
 
 import logging
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
-from itertools import chain
+from itertools import chain, pairwise
 
 import numpy as np
 
@@ -35,6 +36,8 @@ class JUMPS:
     """Number of photos below which their order is no evidence."""
     jump: float = 5.0
     """Length of a jump, in median steps."""
+    apart: float = 3.0
+    """Difference of the numbers of two photos, in median differences, above which the second starts a series."""
     max_share: float = 0.1
     """Share of jumps above which photos count as unordered."""
 
@@ -75,18 +78,28 @@ def look_alike_entries(joins: Sequence[LookAlikes], matches: MatchGraph) -> list
 
 
 def jumps(model: Reconstruction) -> list[list[str]]:
-    """Return successive photos, by name, that are much farther apart than others; empty if many steps are long."""
+    """Return successive photos of a numbered series that are much farther apart than others; empty if many steps are.
+
+    Numbers that are much farther apart than others start another series, perhaps elsewhere.
+    """
     with translate_errors("reading poses"):
-        centers_by_name = sorted((image.name, image.projection_center()) for image in posed_images(model))
-    if len(centers_by_name) < JUMPS.min_photos:
+        centers = {image.name: image.projection_center() for image in posed_images(model)}
+    if len(centers) < JUMPS.min_photos:
         return []
-    steps = np.linalg.norm(np.diff([center for _, center in centers_by_name], axis=0), axis=1)
-    long = np.flatnonzero(steps > JUMPS.jump * np.median(steps))
-    return (
-        [[centers_by_name[k][0], centers_by_name[k + 1][0]] for k in long]
-        if len(long) <= JUMPS.max_share * len(steps)
-        else []
-    )
+    numbered = sorted((*_series(name), name) for name in centers)
+    names = [name for *_, name in numbered]
+    steps = np.linalg.norm(np.diff([centers[name] for name in names], axis=0), axis=1)
+    apart = np.array([b[1] - a[1] if a[0] == b[0] else np.inf for a, b in pairwise(numbered)])
+    long = (steps > JUMPS.jump * np.median(steps)) & np.isfinite(apart) & (apart <= JUMPS.apart * np.median(apart))
+    if np.count_nonzero(long) > JUMPS.max_share * len(steps):
+        return []
+    return [[names[k], names[k + 1]] for k in np.flatnonzero(long)]
+
+
+def _series(name: str) -> tuple[str, int]:
+    """Return a photo's name without its last number, and that number; 0 where it has none."""
+    parts = re.split(r"(\d+)(?=\D*$)", name, maxsplit=1, flags=re.ASCII)
+    return (f"{parts[0]}*{parts[2]}", int(parts[1])) if len(parts) > 1 else (name, 0)
 
 
 def sides(pairs: Sequence[PairId], matches: MatchGraph) -> tuple[list[int], list[int]]:

@@ -64,10 +64,10 @@ def test_the_photos_of_a_join_fall_into_two_places(matches):
     ]
 
 
-def model(places):
+def model(places, name="{:d}.jpg".format):
     def image(number, x):
         return SimpleNamespace(
-            image_id=number, name=f"{number:02d}.jpg", has_pose=True, projection_center=lambda: np.array([x, 0.0, 0.0])
+            image_id=number, name=name(number), has_pose=True, projection_center=lambda: np.array([x, 0.0, 0.0])
         )
 
     return SimpleNamespace(images={number: image(number, x) for number, x in enumerate(places)})
@@ -76,8 +76,25 @@ def model(places):
 def test_a_walk_that_jumps_is_named_where_it_does():
     steady = np.arange(36) + np.tile([0.0, 0.1], 18)
     assert jumps(model(steady)) == []
-    assert jumps(model([*steady[:7], *(steady[7:] + 12.0)])) == [["06.jpg", "07.jpg"]]
+    assert jumps(model([*steady[:7], *(steady[7:] + 12.0)])) == [["6.jpg", "7.jpg"]]
+    assert jumps(model([*steady[:12], *(steady[12:] + 12.0)], "frame_{:03d}0.png".format)) == [
+        ["frame_0110.png", "frame_0120.png"]
+    ]
     assert jumps(model([*steady[:7], *(steady[7:] + 2.0)])) == []
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        lambda number: f"DSC_{number + 80 * (number > 11):04d}.JPG",
+        lambda number: f"{'court' if number > 11 else 'gate'}/{number:02d}.jpg",
+        lambda number: f"{chr(ord('A') + number // 26)}{chr(ord('a') + number % 26)}.jpg",
+    ],
+    ids=["numbers far apart", "folders", "no numbers"],
+)
+def test_a_series_that_starts_elsewhere_is_no_jump(name):
+    places = np.arange(36) + np.tile([0.0, 0.1], 18)
+    assert jumps(model([*places[:12], *(places[12:] + 12.0)], name)) == []
 
 
 def test_photos_in_no_order_do_not_jump():
