@@ -10,10 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.dense import map_file, normals_file, read_depth, write_depth, write_fusion_views
+from sfm_app.colmap.dense import map_file, normals_file, read_depth, read_gray, write_depth, write_fusion_views
 from sfm_app.colmap.surface import FUSED, fuse, open_points, positions, write_points
 from sfm_app.files import fingerprint, mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.meshing.blocks import split_points
@@ -23,9 +24,10 @@ from sfm_app.operating_system import share_bytes
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import FUSED_AT_ONCE_MP, MAPS_MB_PER_MP, cache_gb
 from sfm_app.stereo import View, region
+from sfm_app.stereo.patch_match import BORDER
 from sfm_app.surface.spanning import GAP
 from sfm_app.tasks import Task
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types.arrays import BoolArray, FloatArray
 
 MOST_PIXELS = int(1e6 * FUSED_AT_ONCE_MP)
 """Pixels of depth maps that are fused at once."""
@@ -37,6 +39,13 @@ point."""
 LONE = 3.0
 """Least distance of a point of too few photos from all others, in distances of points: a nearer one is their noise.
 Chosen by hand. The greatest is GAP: farther points have nothing to confirm them, and open the ground of castle-P19."""
+WINDOW_PX = 2 * BORDER + 1
+"""Side of the square of pixels that matching compares."""
+LEAST_TEXTURE = 1.5
+"""Least standard deviation of the gray levels in it where one photo alone shows a point. Chosen by hand: skies have 0.7
+to 1.4."""
+OWN_DEPTH = 1e-3
+"""Relative difference within which a point of one photo is that of a pixel: rounding."""
 FUSING = "fusing"
 """Folder beside the points while they are fused."""
 
@@ -152,9 +161,26 @@ def fuse_points(
     lone = np.flatnonzero(~keep)
     gap, _ = cKDTree(places[keep]).query(places[lone])
     step = OPTIONS.spacing_px * finest_pixels(places[lone], views)
-    keep[lone] = (gap > LONE * step) & (gap < GAP * step)
+    beside = lone[(gap > LONE * step) & (gap < GAP * step)]
+    keep[beside] = show_texture(places[beside], dense_dir, views)
     keep &= ((places >= box[0]) & (places <= box[1])).all(axis=1)
     write_points([records[keep]], target)
+
+
+def show_texture(points: FloatArray, dense_dir: Path, views: Sequence[View]) -> BoolArray:
+    """Return (N,) whether a photo shows texture where its map has a point: the spill into a plain sky has none."""
+    found = np.zeros(len(points), np.bool_)
+    for view in views:
+        depth, gray = read_depth(dense_dir, view, "geometric"), read_gray(dense_dir, view).astype(np.float32)
+        mean = cv2.blur(gray, (WINDOW_PX, WINDOW_PX))
+        textured = cv2.blur(gray * gray, (WINDOW_PX, WINDOW_PX)) - mean * mean >= LEAST_TEXTURE**2
+        u, v, z = view.projection @ np.column_stack([points, np.ones(len(points))]).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            col, row = np.rint(np.stack([u, v]) / z - view.sample_px)
+        at = np.flatnonzero((z > 0) & (col >= 0) & (row >= 0) & (col < view.width) & (row < view.height))
+        row, col = row[at].astype(np.int64), col[at].astype(np.int64)
+        found[at] |= textured[row, col] & np.isclose(depth[row, col], z[at], rtol=OWN_DEPTH)
+    return found
 
 
 def sample_points(dense_dir: Path, view: View) -> FloatArray:
