@@ -53,6 +53,12 @@ class SiftSettings:
     """Options of COLMAP's SIFT that differ from its defaults."""
 
 
+EQUALIZER = cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8))
+"""Raises local contrast up to fourfold. Chosen on walnut12: with 10, noise gives wrong matches."""
+FLAT_WINDOW, FLAT_GRAY, FLAT_SHARE = (7, 7), 5.0, 0.1
+"""A photo is flat where fewer windows than this share have this standard deviation of gray levels. A tenth of them
+has 1.5 to 2.4 in photos of walnut12 and bathtub23, and 10 to 34 in those of ten other sets."""
+
 SiftFeatures: TypeAlias = tuple[FloatArray, ByteArray]
 """Keypoints (N, 6) in pixels, with their shapes as in COLMAP's database, and descriptors (N, 128)."""
 
@@ -113,13 +119,18 @@ def _find_in_photos(
     features = _drop_masked(_extract(settings.photos, sizes, extraction, token), masks)
     if settings.sift:
         return features
-    few = {name: len(found[0]) for name, found in features.items() if len(found[0]) < options.enlarge_below}
-    enough, doubled = math.ceil(options.enlarge_below / 2), copy.deepcopy(extraction)
+    poor, pictures = dict[str, Size](), dict[str, ByteArray]()
+    for name, count in sorted((name, len(found[0])) for name, found in features.items()):
+        photo = _read_gray(settings.photos / name) if count < options.enlarge_below else None
+        if photo is not None and _is_flat(photo, options):
+            pictures[name] = _enlarge(EQUALIZER.apply(photo), options)
+        elif count < math.ceil(options.enlarge_below / 2):
+            poor[name] = sizes[name]
+        elif photo is not None:
+            pictures[name] = _enlarge(photo, options)
+    doubled = copy.deepcopy(extraction)
     doubled.sift.first_octave = -1
-    poor = {name: sizes[name] for name, count in few.items() if count < enough}
     features |= _drop_masked(_extract(settings.photos, poor, doubled, token), masks)
-    enlarged = ((name, _enlarge(settings.photos / name, options)) for name in sorted(few.keys() - poor.keys()))
-    pictures = {name: picture for name, picture in enlarged if picture is not None}
     for name, (keypoints, values) in _extract_pictures(pictures, extraction, token).items():
         scale = np.array(sizes[name]) / pictures[name].shape[1::-1]
         features[name] = keypoints * scale[[0, 1, 0, 0, 1, 1]], values
@@ -127,11 +138,23 @@ def _find_in_photos(
     return {name: _largest(found, options.max_features) for name, found in features.items()}
 
 
-def _enlarge(path: Path, options: MatchSettings) -> ByteArray | None:
-    """Return a photo (H, W) with twice the area at which features are found; None if OpenCV cannot read it."""
+def _read_gray(path: Path) -> ByteArray | None:
+    """Return a photo (H, W); None if OpenCV cannot read it."""
     photo = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if photo is None:
-        return None
+    return None if photo is None else np.asarray(photo, np.uint8)
+
+
+def _is_flat(photo: ByteArray, options: MatchSettings) -> bool:
+    """Return whether a photo is so dark, hazy or plain that SIFT's contrast threshold hides its texture."""
+    scale = min(1.0, options.max_image_size_px / max(photo.shape))
+    gray = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.float32)
+    mean = cv2.blur(gray, FLAT_WINDOW)
+    deviation = np.sqrt(np.maximum(cv2.blur(gray * gray, FLAT_WINDOW) - mean * mean, 0.0))
+    return bool(np.mean(deviation >= FLAT_GRAY) < FLAT_SHARE)
+
+
+def _enlarge(photo: ByteArray, options: MatchSettings) -> ByteArray:
+    """Return a photo (H, W) with twice the area at which features are found."""
     factor = math.sqrt(2.0) * min(1.0, options.max_image_size_px / max(photo.shape))
     size = round(factor * photo.shape[1]), round(factor * photo.shape[0])
     return np.asarray(

@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from scipy.spatial import cKDTree
 
 from sfm_app.colmap.database import create_database, digest_matches, open_database, read_match_graph, unmatched_pairs
 from sfm_app.colmap.features import (
@@ -136,7 +137,7 @@ def test_chunks_keep_all_workers_busy():
 
 
 SIZE = 320, 240
-RICH, POOR, EMPTY = "rich.png", "sub/poor.png", "empty.png"
+RICH, POOR, EMPTY, DARK, HAZY = NAMES = "rich.png", "sub/poor.png", "empty.png", "dark.png", "hazy.png"
 
 
 def grain(cell_px, seed=0):
@@ -152,17 +153,19 @@ def place(tmp_path_factory):
     (folder / "sub").mkdir()
     poor = np.full(SIZE[::-1], 128, np.uint8)
     poor[:120, :160] = grain(6)[:120, :160]
-    for name, pixels in {RICH: grain(6), POOR: poor, EMPTY: np.full_like(poor, 90)}.items():
+    faint = np.uint8(grain(6) // 20)
+    pictures = {RICH: grain(6), POOR: poor, EMPTY: np.full_like(poor, 90), DARK: faint, HAZY: faint + np.uint8(190)}
+    for name, pixels in pictures.items():
         Image.fromarray(pixels).save(folder / name)
     return folder
 
 
 def find(place, database, **options):
     """Keypoints (N, 2) of each photo, by name."""
-    photos = PhotoSet(place, tuple(Photo(name, *SIZE, "g") for name in (RICH, POOR, EMPTY)))
+    photos = PhotoSet(place, tuple(Photo(name, *SIZE, "g") for name in NAMES))
     if not database.exists():
         create_database(database, photos)
-    find_sift(database, SiftSettings(place, None, MatchSettings(**options)), (RICH, POOR, EMPTY), 1, Progress())
+    find_sift(database, SiftSettings(place, None, MatchSettings(**options)), NAMES, 1, Progress())
     graph = read_match_graph(database, photos)
     return {graph.images[key].name: at for key, at in graph.keypoints.items()}
 
@@ -181,11 +184,20 @@ def test_only_photos_that_show_little_are_enlarged(place, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", [DARK, HAZY])
+def test_faint_photos_have_the_features_of_clear_ones(place, tmp_path, name):
+    found = find(place, tmp_path / "found.db", enlarge_below=100_000)
+    assert len(find(place, tmp_path / "own.db", enlarge_below=0)[name]) < 0.2 * len(found[RICH])
+    distances, _ = cKDTree(found[name]).query(found[RICH])
+    assert len(found[name]) < 2 * len(found[RICH]) and np.mean(distances < 1.0) > 0.7
+
+
+@pytest.mark.slow
 def test_what_a_killed_run_has_found_stays(place, tmp_path):
     """Photos with keypoints are not searched again, also with other options."""
     database = tmp_path / "kept.db"
     first = find(place, database, enlarge_below=0)
     again = find(place, database, enlarge_below=100_000)
-    assert first.keys() == again.keys() == {RICH, POOR, EMPTY}
+    assert first.keys() == again.keys() == set(NAMES)
     for name, keypoints in first.items():
         np.testing.assert_array_equal(again[name], keypoints)
