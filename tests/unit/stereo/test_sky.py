@@ -93,6 +93,16 @@ def test_depths_extended_into_the_sky_are_sky(gray):
         assert found[rim & ~mixed].mean() > 0.98
 
 
+def test_only_what_is_near_the_sky_and_of_its_gray_is_sky():
+    gray, cells = np.full((HEIGHT, WIDTH), 100, np.uint8), np.zeros((96, 128), bool)
+    gray[:205], gray[205:215], gray[400:420] = 200, 208, 200  # a sky, the roof before it, and a puddle
+    cells[:40] = True
+
+    found = sky_pixels(gray, cells)
+
+    assert found[:204].all() and not found[206:].any()
+
+
 def test_a_plain_wall_and_a_dark_background_are_no_sky():
     photos = photograph_all(220.0, plain_wall)
 
