@@ -29,7 +29,7 @@ LEAST_LOOKED = 0.4
 """Least share of it that they look at. Chosen by hand: hidden corners of the demo have a third or less; the gap
 behind the pediment of fountain-P11 has 0.44."""
 MOST_AGAINST = 0.3
-"""Largest share of a patch that photos see through. Chosen by hand: with half, fountain-P11 gets false patches."""
+"""Largest share of a patch that photos see through. Chosen on fountain-P11: at half, more pixels are off."""
 SMOOTHING = 3
 """Steps of smoothing: the cut passes through points with noise. Chosen by hand."""
 LEAST_CONFIRMED = 200
