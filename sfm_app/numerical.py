@@ -1,4 +1,4 @@
-"""Errors of computations, finite values, JSON, and a shared constant."""
+"""Errors of computations, finite values, JSON, local deviations, and a shared constant."""
 
 import json
 import math
@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfm_app.errors import NumericalError
 
@@ -29,6 +30,15 @@ def error_reason(err: Exception) -> str:
 def finite_entries(values: Mapping[str, float | None]) -> dict[str, float]:
     """Return the finite entries."""
     return {name: value for name, value in values.items() if value is not None and np.isfinite(value)}
+
+
+def local_deviation(gray: NDArray[np.uint8], side_px: int) -> NDArray[np.float32]:
+    """Return (H, W) the standard deviation of gray levels (H, W) in the square of odd side around each pixel."""
+    import cv2
+
+    values, window = gray.astype(np.float32), (side_px, side_px)
+    mean = cv2.blur(values, window)
+    return np.asarray(np.sqrt(np.maximum(cv2.blur(values * values, window) - mean * mean, 0)), np.float32)
 
 
 def json_text(value: Any) -> str:

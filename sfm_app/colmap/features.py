@@ -28,6 +28,7 @@ from sfm_app.colmap.backend import pycolmap, run_with_progress, translate_errors
 from sfm_app.colmap.database import open_database, panorama_names
 from sfm_app.colmap.worker_process import ProcessGroup, ProgressReporter, SiftOption
 from sfm_app.files import replace_atomically
+from sfm_app.numerical import local_deviation
 from sfm_app.photos.decode import read_picture, upright_image
 from sfm_app.photos.masks import read_mask
 from sfm_app.progress import Progress
@@ -53,9 +54,9 @@ class SiftSettings:
     """Options of COLMAP's SIFT that differ from its defaults."""
 
 
-EQUALIZER = cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8))
-"""Raises local contrast up to fourfold. Chosen on walnut12: with 10, noise gives wrong matches."""
-FLAT_WINDOW, FLAT_GRAY, FLAT_SHARE = (7, 7), 5.0, 0.1
+MOST_GAIN = 4.0
+"""Largest gain of local contrast in a flat photo. Chosen on walnut12: with 10, noise gives wrong matches."""
+FLAT_WINDOW_PX, FLAT_GRAY, FLAT_SHARE = 7, 5.0, 0.1
 """A photo is flat where fewer windows than this share have this standard deviation of gray levels. A tenth of them
 has 1.5 to 2.4 in photos of walnut12 and bathtub23, and 10 to 34 in those of ten other sets."""
 
@@ -123,7 +124,7 @@ def _find_in_photos(
     for name, count in sorted((name, len(found[0])) for name, found in features.items()):
         photo = _read_gray(settings.photos / name) if count < options.enlarge_below else None
         if photo is not None and _is_flat(photo, options):
-            pictures[name] = _enlarge(EQUALIZER.apply(photo), options)
+            pictures[name] = _enlarge(_equalize(photo), options)
         elif count < math.ceil(options.enlarge_below / 2):
             poor[name] = sizes[name]
         elif photo is not None:
@@ -147,10 +148,14 @@ def _read_gray(path: Path) -> ByteArray | None:
 def _is_flat(photo: ByteArray, options: MatchSettings) -> bool:
     """Return whether a photo is so dark, hazy or plain that SIFT's contrast threshold hides its texture."""
     scale = min(1.0, options.max_image_size_px / max(photo.shape))
-    gray = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.float32)
-    mean = cv2.blur(gray, FLAT_WINDOW)
-    deviation = np.sqrt(np.maximum(cv2.blur(gray * gray, FLAT_WINDOW) - mean * mean, 0.0))
-    return bool(np.mean(deviation >= FLAT_GRAY) < FLAT_SHARE)
+    gray = np.asarray(cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+    return bool(np.mean(local_deviation(gray, FLAT_WINDOW_PX) >= FLAT_GRAY) < FLAT_SHARE)
+
+
+def _equalize(photo: ByteArray) -> ByteArray:
+    """Return a photo (H, W) with up to `MOST_GAIN` times its local contrast."""
+    # one object per call: its buffers are not for several threads
+    return np.asarray(cv2.createCLAHE(clipLimit=MOST_GAIN, tileGridSize=(8, 8)).apply(photo), np.uint8)
 
 
 def _enlarge(photo: ByteArray, options: MatchSettings) -> ByteArray:

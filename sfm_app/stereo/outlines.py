@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from sfm_app.jit import kernel
+from sfm_app.numerical import local_deviation
 from sfm_app.stereo.patch_match import BORDER, PhotoStack, PlaneArray, plane_normals, planes_of, stack_photos, warp
 from sfm_app.stereo.view import DepthMap, GrayImage, View
 from sfm_app.types.arrays import BoolArray, FloatArray
@@ -54,9 +55,7 @@ def sharpen_outlines(
     Behind an object may be nothing: a plain gap without depths that is wider than two rims.
     """
     planes, known = planes_of(maps.depth, maps.normals, view), maps.depth > 0
-    gray = image.astype(np.float32)
-    mean = cv2.blur(gray, (3, 3))
-    plain = cv2.blur(gray * gray, (3, 3)) - mean * mean <= PLAIN_GRAY**2
+    plain = local_deviation(image, 3) <= PLAIN_GRAY
     empty = np.asarray(cv2.morphologyEx((plain & ~known).view(np.uint8), cv2.MORPH_OPEN, DISC)).view(np.bool_)
     nearness = planes[..., 0]
     lowest = cv2.erode(np.where(known | empty, nearness, np.float32(np.inf)), DISC, borderType=cv2.BORDER_REPLICATE)

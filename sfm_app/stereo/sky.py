@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.numerical import local_deviation
 from sfm_app.stereo.view import GrayImage, View
 from sfm_app.types.arrays import BoolArray, DepthArray, FloatArray, IndexArray
 
@@ -78,10 +79,8 @@ class PhotoAreas:
 
 def blank_areas(photo: GrayImage, depth: DepthArray) -> PhotoAreas:
     """Find the bright and even areas of a photo with hardly any depths."""
-    gray, window = photo.astype(np.float32), (OPTIONS.window_px, OPTIONS.window_px)
-    mean = cv2.blur(gray, window)
-    variation = np.sqrt(np.maximum(cv2.blur(gray * gray, window) - mean * mean, 0))
-    cells, known = _to_cells(gray), _to_cells((depth > 0).astype(np.float32))
+    variation = local_deviation(photo, OPTIONS.window_px)
+    cells, known = _to_cells(photo.astype(np.float32)), _to_cells((depth > 0).astype(np.float32))
     blank = (known < OPTIONS.open_share) & (_to_cells(variation) <= OPTIONS.most_variation)
     labels = cv2.connectedComponents(blank.view(np.uint8), connectivity=4)[1]
     surfaces = known >= OPTIONS.known_share

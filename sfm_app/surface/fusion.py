@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from sfm_app.files import fingerprint, mark_unfinished, replace_atomically, resu
 from sfm_app.meshing.blocks import split_points
 from sfm_app.meshing.refinement import finest_pixels
 from sfm_app.meshing.tetrahedra import OPTIONS
+from sfm_app.numerical import local_deviation
 from sfm_app.operating_system import share_bytes
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import FUSED_AT_ONCE_MP, MAPS_MB_PER_MP, cache_gb
@@ -171,9 +171,8 @@ def show_texture(points: FloatArray, dense_dir: Path, views: Sequence[View]) -> 
     """Return (N,) whether a photo shows texture where its map has a point: the spill into a plain sky has none."""
     found = np.zeros(len(points), np.bool_)
     for view in views:
-        depth, gray = read_depth(dense_dir, view, "geometric"), read_gray(dense_dir, view).astype(np.float32)
-        mean = cv2.blur(gray, (WINDOW_PX, WINDOW_PX))
-        textured = cv2.blur(gray * gray, (WINDOW_PX, WINDOW_PX)) - mean * mean >= LEAST_TEXTURE**2
+        depth = read_depth(dense_dir, view, "geometric")
+        textured = local_deviation(read_gray(dense_dir, view), WINDOW_PX) >= LEAST_TEXTURE
         u, v, z = view.projection @ np.column_stack([points, np.ones(len(points))]).T
         with np.errstate(divide="ignore", invalid="ignore"):
             col, row = np.rint(np.stack([u, v]) / z - view.sample_px)
