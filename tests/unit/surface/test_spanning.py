@@ -131,6 +131,19 @@ def test_one_photo_that_sees_through_a_hole_counts_less_than_two_that_see_nothin
     assert total(most) == pytest.approx(4.0 - WIDE**2, abs=0.1)
 
 
+@pytest.mark.parametrize(("share", "closed"), [(0.15, True), (0.6, False)])
+def test_a_hole_is_closed_if_photos_see_through_little_of_it(seen, share, closed):
+    nothing, wall = Sheet(WIDE, "nothing"), Sheet(WIDE, "wall")
+
+    def depths(view):
+        left = plane_depths(view, 0.0)[1][..., 0] < (share - 0.5) * WIDE
+        return np.where(left, wall.depths(view), nothing.depths(view))
+
+    found, _ = seen(nothing.cloud, ABOVE, depths)
+
+    assert total(found) == pytest.approx(4.0 if closed else 4.0 - WIDE**2, abs=0.15)
+
+
 def test_points_that_more_photos_see_through_than_confirm_are_left_out(seen):
     """One photo shows a leaf in a hole where the three others show the sky."""
     sheet = Sheet(WIDE, "sky")
