@@ -94,13 +94,25 @@ def find_intrinsics(matches: MatchGraph, views: ViewGraph, run: RunContext) -> I
         selected = select_inliers_through_lens(matches, sample, cameras, run)
         if selected is sample:
             break
-        cameras = _calibrate(matches, selected, run)
+        before, cameras = cameras, _calibrate(matches, selected, run, cameras)
+        if _agree(before, cameras):
+            break
     images = matches.images.values()
     for group, lens in views.lenses.items():  # they precede the fundamental matrices
         cameras.append(CalibratedCamera(group, tuple(image.id for image in images if image.group == group), lens))
     report_claims({camera.name: _claim(camera, matches) for camera in cameras}, run)
     cameras = _take_given_cameras(cameras, matches, run)
     return to_intrinsics((replace(camera, found=explain_failure(camera, views)) for camera in cameras), matches)
+
+
+def _agree(before: Sequence[CalibratedCamera], after: Sequence[CalibratedCamera]) -> bool:
+    """Return whether focals moved by less than their deviations: then other inliers would not move them, either."""
+    earlier = {camera.photos: camera.found.K[0, 0] for camera in before}
+    known = [camera for camera in after if "fx" in camera.found.spread]
+    if not known or any(camera.photos not in earlier for camera in known):
+        return False
+    moves = [(camera.found.K[0, 0] - earlier[camera.photos]) / camera.found.spread["fx"] for camera in known]
+    return float(np.mean(np.square(moves))) <= 1.0
 
 
 def find_evidence(matches: MatchGraph, run: RunContext, known: Evidence) -> Evidence:
@@ -133,14 +145,16 @@ def sample_pairs(views: ViewGraph, photos: int) -> ViewGraph:
     return replace(views, fits={pair: fit for pair, fit in views.fits.items() if pair in chosen})
 
 
-def _calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> list[CalibratedCamera]:
+def _calibrate(
+    matches: MatchGraph, views: ViewGraph, run: RunContext, before: Sequence[CalibratedCamera] = ()
+) -> list[CalibratedCamera]:
     options = run.settings.calibration
     calibrator = run.plugins.calibrator(options.calibrator)
     pairs = photo_pairs([image for image in matches.images.values() if image.group not in views.lenses], matches, views)
     # groups that the user defined are not split
     split = run.settings.photos.cameras == "auto"
     cameras = calibrate_photo_set(
-        pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=split
+        pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=split, before=before
     )
     return [to_whole_photo(camera, matches.images[camera.photos[0]]) for camera in cameras]
 

@@ -30,7 +30,7 @@ of later steps by more than a million. It follows from double precision. docs/al
 class SystemOptions:
     """How systems of different size are solved."""
 
-    most_eliminated: int = 1500
+    most_eliminated: int = 100
     """Unknowns up to which systems are solved without LAPACK: the time grows with the cube. By hand, for speed."""
     most_dense: int = 12_000
     """Unknowns up to which a sparse system may be solved as a dense one. Chosen by hand for speed and memory."""
@@ -62,7 +62,12 @@ def lift_eigenvalues(
         diagonal = np.einsum("...ii->...i", S)
         scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     pairs = scale[..., :, None] * scale[..., None, :]
-    values, vectors = np.linalg.eigh(S / pairs)
+    try:
+        np.linalg.cholesky(S / pairs - least * np.eye(S.shape[-1]))
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(S / pairs)
+    else:  # no eigenvalue is below, and this costs a tenth of computing them
+        return S
     singular = np.any(values < least, axis=-1, keepdims=True)[..., None]
     if not singular.any():
         return S

@@ -19,7 +19,7 @@ import numpy as np
 
 from sfm_app.camera.projection import BEARING, RADIUS
 from sfm_app.fundamental.solvers import mirror
-from sfm_app.geometry.least_squares import DampingRange, damped_step, solve_each
+from sfm_app.geometry.least_squares import DampingRange, damped_step, solve_each, solve_positive
 from sfm_app.geometry.poses import POSE_DOF, retract, sampson_of_rays, write_essential, write_nearby_essentials
 from sfm_app.jit import kernel
 from sfm_app.numerical import MAD_TO_SIGMA
@@ -390,7 +390,7 @@ def _take_step(
         H, g = matches.assemble(Information(hessians, gradients, np.empty(0)), factors)
         H += np.diag(prior.precision.ravel())
         g += (prior.precision * (prior.mean - state.thetas)).ravel()
-        step = solve_each(H + damping * np.diag(np.diag(H)), g[:, None]).reshape(-1, CAMERA)
+        step = solve_positive(H + damping * np.diag(np.diag(H)), g[:, None]).reshape(-1, CAMERA)
         of_pairs = step[matches.cameras].reshape(-1, 2 * CAMERA)
         pose_steps = pose_alone - (pose_by_cameras @ of_pairs[..., None])[..., 0]
         poses = np.array([retract(*moved) for moved in zip(state.poses, pose_steps, strict=True)]).reshape(-1, 12)

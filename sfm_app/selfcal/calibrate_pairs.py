@@ -49,6 +49,8 @@ class FITTING:
 
     few_matches: int = 100
     """Matches per pair that choose its pose and adjust the cameras until these nearly converge; by hand."""
+    all_matches: int = 300_000
+    """Matches of all pairs together, but never fewer than that of a pair: those of 300 full pairs; by hand."""
     first_rounds: int = 8
     """Rounds before the fits of several starts are compared; by hand."""
     last_rounds: int = 12
@@ -120,6 +122,7 @@ class Fit:
 def fit_cameras(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], priors: CameraPriors) -> Fit:
     """Fit the cameras from all starts (C, 5), likely ones first, then with any pixels; return the best fit."""
     few = matches.subsample(FITTING.few_matches)
+    matches = matches.subsample(max(FITTING.few_matches, FITTING.all_matches // max(len(Fs), 1)))
     best = _select_best([_fit_from_start(few, Fs, thetas, priors, square=True) for thetas in starts])
     others = [_fit_from_start(few, Fs, thetas, priors, square=False) for thetas in (best.state.thetas, starts[0])]
     fit = _select_best([best, *others])

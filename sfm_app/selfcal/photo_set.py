@@ -49,27 +49,37 @@ class CalibratedCamera:
     """Number of the group, where each of its photos has its own camera; else -1."""
     divided: bool = False
     """Whether its group has two cameras."""
+    known: bool | None = None
+    """Whether its own pairs determine it; None before all pairs were adjusted together."""
 
 
 def calibrate_photo_set(
     pairs: PhotoPairs, calibrate: CalibrateFunction, options: CalibrationSettings, seed: int, *,
-    together: bool, split: bool = True,
+    together: bool, split: bool = True, before: Sequence[CalibratedCamera] = (),
 ) -> list[CalibratedCamera]:  # fmt: skip
-    """Return all cameras, those of most photos first; `together` uses pairs between cameras, `split` divides groups."""
+    """Return all cameras, those of most photos first; `together` uses pairs between cameras, `split` divides groups.
+
+    Several cameras `before`, of other inliers of the same pairs, are not divided again.
+    """
+    again = together and len(before) > 1
     groups: dict[str, list[int]] = {}
     for photo, group in pairs.groups.items():
         groups.setdefault(group, []).append(photo)
-    cameras = [
-        CalibratedCamera(
-            name, tuple(members), _calibrate_alone(calibrate, pairs.to_camera_pairs(members), options, seed)
-        )
-        for name, members in groups.items()
-    ]
+    cameras = (
+        list(before)
+        if again
+        else [
+            CalibratedCamera(
+                name, tuple(members), _calibrate_alone(calibrate, pairs.to_camera_pairs(members), options, seed)
+            )
+            for name, members in groups.items()
+        ]
+    )
     if together:
         try:
             cameras = (
                 _split_and_calibrate(cameras, pairs, options, seed)
-                if split
+                if split and not again
                 else _calibrate_from_all_pairs(cameras, pairs, options)
             )
         except FAILURES as err:
@@ -199,7 +209,7 @@ def _calibrate_from_all_pairs(
         CameraGroup(
             size=pairs.sizes[camera.photos[0]],
             start=camera.found if camera.found.identifiable else None,
-            known=camera.found.identifiable and bool(camera.found.evidence),
+            known=camera.found.identifiable and bool(camera.found.evidence) if camera.known is None else camera.known,
             prior=pairs.prior_of(camera.photos),
             family=camera.family,
             divided=camera.divided,
@@ -207,7 +217,10 @@ def _calibrate_from_all_pairs(
         for camera in cameras
     ]
     calibrations = calibrate_cameras(groups, everything, members, options, METHOD)
-    return [replace(one, found=found) for one, found in zip(cameras, calibrations, strict=True)]
+    return [
+        replace(one, found=found, known=group.known)
+        for one, group, found in zip(cameras, groups, calibrations, strict=True)
+    ]
 
 
 def _fall_back_to_guess(camera: CalibratedCamera, pairs: PhotoPairs) -> Calibration:

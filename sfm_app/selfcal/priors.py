@@ -151,11 +151,30 @@ class Evidence:
         seen = set[bytes]()
         while free.tobytes() not in seen:
             seen.add(free.tobytes())
+            share = redundancy(free, self.pairs)
+            _, step, covariance = self.posterior(free)
             for camera in range(len(free)):
-                _, step, covariance = self.posterior(free)
-                trials, posterior = self.camera_posteriors(free, camera, step, covariance)
-                free = trials[np.argmax(posterior.log_evidence)]
+                trials, posterior = self.camera_posteriors(free, camera, (step, covariance), share)
+                best = trials[np.argmax(posterior.log_evidence)]
+                if not np.array_equal(best, free):
+                    step, covariance = self._with_choice(free, best, camera, (step, covariance))
+                    free = best
         return free
+
+    def _with_choice(
+        self, free: BoolArray, best: BoolArray, camera: int, normal: tuple[FloatArray, FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return mean step and covariance after one camera has changed its choice (Woodbury 1950)."""
+        step, covariance = normal
+        before, after = (self.priors.prior(choice, self.thetas) for choice in (free, best))
+        more = after.precision[camera] - before.precision[camera]
+        pull = after.precision[camera] * (after.mean - self.thetas)[camera]
+        pull -= before.precision[camera] * (before.mean - self.thetas)[camera]
+        block = slice(CAMERA * camera, CAMERA * (camera + 1))
+        rows = covariance[:, block]
+        gain = rows @ np.linalg.inv(np.eye(CAMERA) + more[:, None] * rows[block]) * more
+        covariance = covariance - gain @ rows.T
+        return step - gain @ step[block] + covariance[:, block] @ pull, covariance
 
     def undetermined_parts(self, free: BoolArray) -> BoolArray:
         """Return (C, 4) the parts that are not freed, not narrowed by the pairs, and not contradicted by them."""
@@ -170,24 +189,28 @@ class Evidence:
 
     def covariance(self, free: BoolArray) -> FloatArray:
         """Return (5C, 5C) mean squares of the cameras about `thetas`, over all choices for each camera."""
-        _, step, covariance = self.posterior(free)
-        total = covariance.copy()
+        _, *normal = self.posterior(free)
+        total = normal[1].copy()
         for camera in range(len(free)):
-            _, posterior = self.camera_posteriors(free, camera, step, covariance)
+            _, posterior = self.camera_posteriors(free, camera, normal, redundancy(free, self.pairs))
             block = slice(CAMERA * camera, CAMERA * (camera + 1))
             total[block, block] = posterior.mean_squares(np.zeros(CAMERA))
         return total
 
     def camera_posteriors(
-        self, free: BoolArray, camera: int, step: FloatArray, covariance: FloatArray
+        self, free: BoolArray, camera: int, normal: Sequence[FloatArray], share: float
     ) -> tuple[BoolArray, least_squares.Posteriors]:
-        """Return all choices (K, C, 4) for one camera, and its posteriors; `step` and `covariance` are of `free`."""
+        """Return all choices (K, C, 4) for one camera, and its posteriors.
+
+        `normal` are the mean step and the covariance of `free`, and `share` is their redundancy.
+        """
+        step, covariance = normal
         block = slice(CAMERA * camera, CAMERA * (camera + 1))
         prior, trials = self.priors.prior(free, self.thetas), self.choices(free, camera)
         offset = prior.mean - self.thetas
         H, g = least_squares.cavity(covariance[block, block], step[block], prior.precision[camera], offset[camera])
         others = [self.priors.prior(trial, self.thetas) for trial in trials]
-        scale = np.array([redundancy(trial, self.pairs) for trial in trials]) / redundancy(free, self.pairs)
+        scale = np.array([redundancy(trial, self.pairs) for trial in trials]) / share
         posterior = least_squares.posteriors(
             scale[:, None, None] * H, scale[:, None] * g,
             least_squares.NormalPriors(
