@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from sfm_app.formats import EXPORTERS, SCENE_EXPORTERS
 from sfm_app.formats.exporters import Exporter, SceneExporter
 from sfm_app.fundamental import ESTIMATORS
-from sfm_app.plugins import CPU, SIFT, SIFT_DSP, Calibrator, DepthMethod, Estimator, FeatureMethod, hookimpl
+from sfm_app.plugins import CPU, SIFT, SIFT_AFFINE, Calibrator, DepthMethod, Estimator, FeatureMethod, hookimpl
 from sfm_app.selfcal import CALIBRATORS, SEVERAL_CAMERAS
 from sfm_app.types import Rejected
 
@@ -14,11 +14,9 @@ if TYPE_CHECKING:  # OpenCV, which stereo needs, takes longer to load than an es
     from sfm_app.stereo.view import DepthTask
 
 
-SIFT_DSP_SUMMARY = "COLMAP's SIFT, slower: affine shape, domain-size pooling, fainter features; for plain things"
-SIFT_DSP_OPTIONS = {"estimate_affine_shape": True, "domain_size_pooling": True, "peak_threshold": 0.0007}
-"""A tenth of COLMAP's contrast. Chosen on dinoSparseRing, where half of all neighbors have no match with COLMAP's own:
-raw matches of the five weakest links of its ring are 0 0 16 0 19 with `sift`, 19 0 32 35 65 with 0.002, 28 27 42 49 97
-with 0.001, 36 31 40 51 109 with 0.0005, which takes twice as long as 0.001."""
+SIFT_AFFINE_SUMMARY = "COLMAP's SIFT, slower: affine shape, fainter features; for plain things"
+SIFT_AFFINE_OPTIONS = {"estimate_affine_shape": True, "peak_threshold": 0.0007}
+"""A tenth of COLMAP's contrast. Chosen on dinoSparseRing, where half of all neighbors have no match with COLMAP's own."""
 
 
 def _make_depth_maps_on_cpu(task: "DepthTask") -> list[Rejected | None]:
@@ -47,7 +45,7 @@ def sfm_features() -> Iterable[FeatureMethod]:
     """Return COLMAP's SIFT, with and without domain size pooling."""
     return [
         FeatureMethod(SIFT, summary="COLMAP's SIFT", sift={}),
-        FeatureMethod(SIFT_DSP, summary=SIFT_DSP_SUMMARY, sift=SIFT_DSP_OPTIONS),
+        FeatureMethod(SIFT_AFFINE, summary=SIFT_AFFINE_SUMMARY, sift=SIFT_AFFINE_OPTIONS),
     ]
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # OpenCV, which stereo needs, takes longer to load than an es
 GROUP, BUILT_IN = "sfm_app", "sfm_app.built_in"
 """Entry points of plug-ins, and the module of the built-in methods."""
 AUTO, CPU, NONE = "auto", "cpu", "none"
-SIFT, SIFT_DSP = "sift", "sift-dsp"
+SIFT, SIFT_AFFINE = "sift", "sift-affine"
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
 

@@ -130,6 +130,34 @@ def fade_colors(scene: SyntheticScene, strength: float) -> SyntheticScene:
     )
 
 
+def equal_halves(scene: SyntheticScene) -> SyntheticScene:
+    """Return the scene with every body but the ground a second time, half a turn about the y axis, and as it looks."""
+    floor, *others = scene.bodies
+    twice = (replace(body, shape=assemble([body.shape, body.shape.move(turn_deg=180.0)], True)) for body in others)
+    return replace(scene, bodies=(floor, *twice))
+
+
+def mixed_cameras(views: Views, count: int, reach: float, rng: Random) -> Views:
+    """Return the photos by several cameras of one size, in turn at random.
+
+    Args:
+        views: before.
+        count: of the cameras.
+        reach: largest change of log f.
+        rng: draws the cameras.
+    """
+    which = rng.permutation(np.arange(len(views.cameras)) % count)
+    for number in range(count):
+        names = [name for name, own in zip(sorted(views.cameras), which, strict=True) if own == number]
+        if not names:
+            continue
+        camera = with_zoom(views.cameras[names[0]], math.exp(rng.uniform(-reach, reach)))
+        K = camera.K.copy()
+        K[:2, 2] += rng.normal(0.0, 0.008, 2) * (camera.width, camera.height)
+        views = views.with_camera(replace(camera, K=K), names)
+    return views
+
+
 def _random_thing(rng: Random, size: tuple[float, float] = (0.3, 0.9)) -> Shape:
     """Return a random object that stands on y = 0 around the y axis."""
     width, height, depth = rng.uniform(*size, 3)
@@ -172,9 +200,13 @@ WALKS = ("walk", "forward", "sideways", "orbit", "wide steps")
 PLACES = ("things", "plane", "repeats", "look-alikes")
 CAMERA_TROUBLES = ("two cameras", "zoom", "crop", "squeeze", "lens")
 PHOTO_TROUBLES = ("motion blur", "defocus", "moving object", "few features")
+RARE_TROUBLES = ("darkness", "haze", "equal halves", "mixed cameras")
+"""Drawn after all others, by a generator of their own; three of ten folders have one."""
 ORDINARY = ("walk", "things")
 """Choices that do not count as trouble."""
-KINDS = tuple(kind for kind in (*WALKS, *PLACES, *CAMERA_TROUBLES, *PHOTO_TROUBLES) if kind not in ORDINARY)
+KINDS = tuple(
+    kind for kind in (*WALKS, *PLACES, *CAMERA_TROUBLES, *PHOTO_TROUBLES, *RARE_TROUBLES) if kind not in ORDINARY
+)
 """All troubles by name."""
 SIZES = ((480, 320), (512, 384), (384, 512), (576, 384), (640, 480), (640, 400))
 PHOTOS = (6, 20)
@@ -194,19 +226,21 @@ class PhotoDefects:
     """Object that moves from photo to photo."""
     thing_at: Mapping[str, FloatArray] = field(default_factory=dict)
     """By photo name: (3, 4) world_from_thing."""
+    grays: tuple[float, float] = (1.0, 0.0)
+    """Factor on the gray levels, and what is added to them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TroubledFolder:
     """Plan of a folder of photos to render."""
 
-    seed: int
+    seed: int = 0
     troubles: tuple[str, ...]
     """Entries of `KINDS`, in their order; empty without trouble."""
     scene: SyntheticScene
     views: Views
     options: PhotoOptions
-    spoiling: PhotoDefects
+    spoiling: PhotoDefects = PhotoDefects()
 
 
 def troubled_folder(seed: int) -> TroubledFolder:
@@ -222,6 +256,12 @@ def troubled_folder(seed: int) -> TroubledFolder:
         scene = fade_colors(scene, float(rng.uniform(0.1, 0.3)))
     camera = _draw_camera(drawn, rng)
     views = _with_cameras(_draw_views(walk, place, camera, rng), drawn, rng)
+    rare = np.random.default_rng([seed, 56])
+    drawn |= set(_draw_kinds(RARE_TROUBLES, (0.7, 0.3), rare))
+    if "equal halves" in drawn:
+        scene = equal_halves(scene)
+    if "mixed cameras" in drawn:
+        views = mixed_cameras(views, int(rare.integers(3, 7)), 0.3, rare)
     options = PhotoOptions(
         supersampling=1,
         noise=float(rng.uniform(0.5, 3.0)),
@@ -235,7 +275,7 @@ def troubled_folder(seed: int) -> TroubledFolder:
         scene=scene,
         views=views,
         options=options,
-        spoiling=_draw_defects(drawn, views, rng),
+        spoiling=replace(_draw_defects(drawn, views, rng), grays=_draw_grays(drawn, rare)),
     )
 
 
@@ -262,6 +302,7 @@ def write_troubled_folder(folder: Path, plan: TroubledFolder) -> Truth:
             image = apply_motion_blur(image, *spoiling.blur_px.get(name, (0.0, 0.0)))
             sharpness = replace(plan.options, blur_px=max(plan.options.blur_px, spoiling.defocus_px.get(name, 0.0)))
             photo = develop(image, sharpness, np.random.default_rng([plan.seed, k, 31]))
+            photo = np.round(spoiling.grays[0] * photo + spoiling.grays[1]).astype(np.uint8)
             Image.fromarray(photo).save(folder / name, format="JPEG", quality=plan.options.quality)
     except OSError as err:
         raise InputError(f"cannot write photos to {folder}: {err}", hint="choose another folder") from err
@@ -447,6 +488,12 @@ def _draw_defects(drawn: set[str], views: Views, rng: Random) -> PhotoDefects:
         thing=SyntheticScene("thing", thing) if "moving object" in drawn else None,
         thing_at=_random_walk(names, rng),
     )
+
+
+def _draw_grays(drawn: set[str], rng: Random) -> tuple[float, float]:
+    """Draw how much darker, or how hazy, the photos are."""
+    share = float(rng.uniform(0.06, 0.2))
+    return (share, float(rng.uniform(150, 200)) if "haze" in drawn else 3.0) if drawn & {"darkness", "haze"} else (1, 0)
 
 
 def _random_walk(names: list[str], rng: Random) -> dict[str, FloatArray]:

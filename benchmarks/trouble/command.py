@@ -2,6 +2,7 @@
 
     python -m benchmarks.trouble --cache CACHE --folders 200 --keep
     python -m benchmarks.trouble --cache CACHE --only 17 42
+    python -m benchmarks.trouble --cache CACHE --hard statue-by-many equal-boxes palace dark haze --name trouble-hard
     python -m benchmarks.trouble --cache CACHE --folders 100 --keep --without learned-cameras finer-features
 
 A seed determines a folder. With --keep, runs of the same program are reused. --without runs the scene once more without
@@ -33,6 +34,7 @@ from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.corpus.kept_runs import FinishedRun, has_tried, load_finished_run, record_run, run_key, trials
 from benchmarks.corpus.report import GAINS_TEXT, hypothesis_rows
 from benchmarks.corpus.score import Doubt, parameter_errors
+from benchmarks.synthetic.hard import HARD
 from benchmarks.synthetic.trouble import KINDS, troubled_folder, write_troubled_folder
 from sfm_app.settings import HypothesisName
 from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth
@@ -55,10 +57,10 @@ RENDER_LOCK = Lock()
 """Held while rendering, which uses all cores anyway."""
 
 
-def load_folder(seed: int, cache: Path) -> tuple[Path, Truth, tuple[str, ...]]:
-    """Return the photos of a seed, their truth and its troubles; rendered on first use."""
-    plan = troubled_folder(seed)
-    photos, truth = cache / "trouble" / "photos" / f"{seed:05d}", cache / "trouble" / "truth" / f"{seed:05d}"
+def load_folder(seed: int | str, cache: Path) -> tuple[Path, Truth, tuple[str, ...]]:
+    """Return the photos of a seed or hard folder, their truth and its troubles; rendered on first use."""
+    plan = HARD[seed]() if isinstance(seed, str) else troubled_folder(seed)
+    photos, truth = cache / "trouble" / "photos" / f"{seed:>05}", cache / "trouble" / "truth" / f"{seed:>05}"
     with RENDER_LOCK:
         if not truth.exists():  # written last
             shutil.rmtree(photos, ignore_errors=True)
@@ -66,10 +68,10 @@ def load_folder(seed: int, cache: Path) -> tuple[Path, Truth, tuple[str, ...]]:
     return photos, load_truth(truth), plan.troubles
 
 
-def run_folder(seed: int, args: argparse.Namespace) -> list[Row]:
+def run_folder(seed: int | str, args: argparse.Namespace) -> list[Row]:
     """Run the program on one folder, and without each hypothesis that is left out, and score the results."""
     photos, truth, troubles = load_folder(seed, args.cache)
-    whole = args.cache / "trouble" / "runs" / f"{seed:05d}"
+    whole = args.cache / "trouble" / "runs" / photos.name
     rows = []
     for method in (Method(OURS), *ablations(args.without)):
         out = whole.with_name(f"{whole.name}-without-{method.without}") if method.without else whole
@@ -98,7 +100,7 @@ def run_folder(seed: int, args: argparse.Namespace) -> list[Row]:
             code, last = run_command(command, 60 * args.limit_min)
             done = FinishedRun(key, {"exit code": code, "last": last if code else ""})
             record_run(out, done)
-        row = {"method": method.name, "photos": f"{seed:05d}", "seed": seed, "troubles": ", ".join(troubles) or "none"}
+        row = {"method": method.name, "photos": photos.name, "seed": seed, "troubles": ", ".join(troubles) or "none"}
         row |= done.said | score_run(out, truth) | {"trials": trials(out)}
         print(f"{seed}: {method.name}: {summary_line(row)}", file=sys.stderr, flush=True)
         rows.append(row)
@@ -127,7 +129,9 @@ def score_run(out: Path, truth: Truth) -> Row:
     return {
         "placed": f"{found['registered']}/{found['of']}",
         "registered": found["registered"],
-        "map + BA": scene_seconds(out),
+        "map + BA": cpu_seconds(out, "scene"),
+        "features": cpu_seconds(out, "match_graph"),
+        "cameras": cpu_seconds(out, "intrinsics"),
         "share placed": round(found["registered"] / found["of"], 3),
         "models": found["models"],
         "AUC@1": found["AUC@1"],
@@ -140,13 +144,13 @@ def score_run(out: Path, truth: Truth) -> Row:
     }
 
 
-def scene_seconds(out: Path) -> float | None:
-    """Return the CPU seconds of the scene in OUT; None without one."""
+def cpu_seconds(out: Path, stage: str) -> float | None:
+    """Return the CPU seconds of a stage in OUT; None without them."""
     try:
         stages = json.loads((out / "manifest.json").read_text(encoding="utf-8"))["stages"]
     except (OSError, ValueError, KeyError):
         return None
-    seconds: float | None = stages.get("scene", {}).get("cpu_seconds")
+    seconds: float | None = stages.get(stage, {}).get("cpu_seconds")
     return seconds
 
 
@@ -228,6 +232,20 @@ def page(rows: Sequence[Row]) -> str:
         "## By trouble\n",
         table([*trouble_rows(rows)]),
     ]
+    if all(row["seed"] in HARD for row in rows):
+        columns = (
+            "seed",
+            "troubles",
+            "placed",
+            "AUC@5",
+            "features",
+            "cameras",
+            "map + BA",
+            "focal % after",
+            "worst in sd",
+        )
+        parts += ["## Hard folders; CPU seconds of features and pairs, cameras, map and bundle adjustment\n"]
+        parts += [table(rows, columns)]
     parts += ["## Folders that failed, or whose camera is known and wrong\n", table(far, shown) if far else "None.\n"]
     parts += ["## What each hypothesis gains\n", GAINS_TEXT, table(gains)] if gains else []
     return "\n".join(parts)
@@ -244,6 +262,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--folders", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0, help="seed of the first folder; the others count up from it")
     parser.add_argument("--only", nargs="+", type=int, metavar="SEED", help="run only these seeds")
+    parser.add_argument("--hard", nargs="+", choices=HARD, metavar="NAME", help=f"run only {', '.join(HARD)}")
     parser.add_argument("--keep", action="store_true", help="reuse runs of the same program")
     parser.add_argument("--jobs", type=int, default=1, help="folders at a time")
     parser.add_argument("--workers", type=int, default=0, help="workers of each run; 0: one per core")
@@ -260,7 +279,7 @@ def parser() -> argparse.ArgumentParser:
 def main() -> None:
     """Run all folders, and write the results after each."""
     args = parser().parse_args()
-    seeds = args.only or [args.seed + k for k in range(args.folders)]
+    seeds = args.hard or args.only or [args.seed + k for k in range(args.folders)]
     rows: list[Row] = []
     with ThreadPoolExecutor(args.jobs) as pool:
         for of_folder in pool.map(partial(run_folder, args=args), seeds):

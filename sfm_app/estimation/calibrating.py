@@ -47,7 +47,7 @@ class OPTIONS:
     pairs_per_photo: int = 4
     """Least partners of each photo in a sample of more. Chosen by hand."""
     lens_rounds: int = 2
-    """Times that inliers are chosen through the lens so far. Chosen on `benchmarks.lenses.distortion`."""
+    """Most times that inliers are chosen through the lens so far. Chosen on `benchmarks.lenses.distortion`."""
 
 
 # Inliers through a lens (ours). A fundamental matrix of pixels keeps the matches that a lens bends least, and cameras

@@ -18,7 +18,7 @@ from sfm_app.estimation.calibrating import find_evidence
 from sfm_app.mapping.attempt import are_many_unregistered
 from sfm_app.mapping.passes import Outcome
 from sfm_app.matching.features import fill_database
-from sfm_app.plugins import SIFT_DSP
+from sfm_app.plugins import SIFT_AFFINE
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import SubWorkspace
 from sfm_app.types import Evidence, MatchGraph, PairId
@@ -80,7 +80,7 @@ FOLDER, FEATURES = "finer", "features"
 
 def lost_photos(best: Outcome, run: RunContext) -> list[int]:
     """Return the photos missing in the main model; none where their share is small, or features are the finest."""
-    if run.settings.matching.features == SIFT_DSP:
+    if run.settings.matching.features == SIFT_AFFINE:
         return []
     registered = set(posed_photo_ids(best.main.model)) if best.main else set()
     lost = sorted(best.evidence.matches.images.keys() - registered)
@@ -121,7 +121,7 @@ def find_finer_evidence(best: Outcome, run: RunContext) -> tuple[Evidence, RunCo
     with translate_errors("extracting finer features"):
         if not finer.workspace.database.exists():
             write_match_graph(finer.workspace.database, replace(first.matches, keypoints={}, matches={}))
-    fill_database(run.plugins.feature_method(SIFT_DSP), finer, pairs)
+    fill_database(run.plugins.feature_method(SIFT_AFFINE), finer, pairs)
     with translate_errors("adding matches"):
         matches, enriched = add_matches(first.matches, *read_features(finer.workspace.database))
     if not enriched:

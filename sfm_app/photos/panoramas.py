@@ -42,9 +42,9 @@ class OPTIONS:
     """Largest mean step between columns in the first and last row, as a share of the row with the largest steps."""
     seam_px: int = 4
     """Columns of the other border that are added for interpolation. Chosen by hand."""
-    field_deg: float = 90.0
+    field_deg: float = 80.0
     """Field of view of a feature view. The farthest point nearest to a view's axis lies 37 degrees from it, so that
-    the surroundings of every keypoint are inside. Chosen by hand."""
+    the surroundings of most keypoints are inside. Chosen by hand."""
     grid: int = 257
     """Rows and columns of a panorama whose rays the painted views cover. Chosen by hand."""
 
@@ -155,10 +155,10 @@ class PanoramaViews:
 
     @classmethod
     def cover(cls, size: tuple[int, int], most_px: int) -> "PanoramaViews":
-        """Return views of a panorama of (width, height) in its resolution, with sides of at most `most_px`."""
+        """Return views of a panorama (width, height) in its resolution, at most as many pixels as six of `most_px`^2."""
         focal = size[0] / (2.0 * math.pi)
         side = 2.0 * focal * math.tan(math.radians(OPTIONS.field_deg / 2.0))
-        return cls(size, max(1, min(round(side), most_px)), view_rotations())
+        return cls(size, max(1, round(min(side, most_px / math.sqrt(2.0)))), view_rotations())
 
     @property
     def focal_px(self) -> float:

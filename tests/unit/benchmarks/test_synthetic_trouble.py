@@ -1,5 +1,6 @@
 """Folders with random problems."""
 
+from collections import Counter
 from dataclasses import replace
 from functools import cache
 
@@ -12,6 +13,8 @@ from benchmarks.synthetic.trouble import (
     PHOTOS,
     apply_motion_blur,
     cam_from_thing,
+    equal_halves,
+    mixed_cameras,
     moving_thing,
     troubled_folder,
     with_distortion,
@@ -69,12 +72,34 @@ def test_cameras_are_those_of_the_trouble():
         focals = {round(camera.K[0, 0], 6) for camera in plan.views.cameras.values()}
         first = plan.views.cameras["view_00.jpg"]
         off = np.abs(first.K[:2, 2] / (first.width, first.height) - 0.5).max()
-        assert (len(focals) > 2) == ("zoom" in plan.troubles)
-        assert (len(focals) == 1) == (not {"zoom", "two cameras"} & set(plan.troubles))
+        assert (len(focals) > 2) == bool({"zoom", "mixed cameras"} & set(plan.troubles))
+        assert (len(focals) == 1) == (not {"zoom", "mixed cameras", "two cameras"} & set(plan.troubles))
         assert (abs(first.K[1, 1] / first.K[0, 0] - 1) > 0.1) == ("squeeze" in plan.troubles)
         assert off > 0.03 or "crop" not in plan.troubles
         assert len({(camera.width, camera.height) for camera in plan.views.cameras.values()}) == 1
         pixel_rays(first)  # a lens that folds raises
+
+
+def test_mixed_cameras_take_equally_many_photos_each():
+    views = mixed_cameras(plan_with("orbit").views, 3, 0.3, np.random.default_rng(0))
+    counts = Counter(camera.K[0, 0] for camera in views.cameras.values())
+    assert len(counts) == 3 and max(counts.values()) - min(counts.values()) <= 1
+
+
+@pytest.mark.parametrize(("trouble", "darkest", "brightest"), [("darkness", 0, 70), ("haze", 140, 255)])
+def test_dark_and_hazy_photos_have_few_grays(trouble, darkest, brightest, tmp_path):
+    for photo in written(small(plan_with(trouble), photos=1), tmp_path).values():
+        assert photo.min() >= darkest and photo.max() <= brightest
+        assert 0 < np.ptp(photo) < 70
+
+
+def test_equal_halves_look_alike_after_half_a_turn():
+    floor, *bodies = equal_halves(plan_with("orbit").scene).bodies
+    for body in bodies:
+        first, second = np.split(body.shape.vertices, 2)
+        np.testing.assert_allclose(second, first * [-1.0, 1.0, -1.0], atol=1e-9)
+        np.testing.assert_array_equal(*np.split(body.shape.texture, 2))
+    assert len(np.unique(floor.shape.vertices, axis=0)) == len(floor.shape.vertices)
 
 
 def test_a_lens_pushes_the_farthest_corner_by_what_is_asked_and_zooming_keeps_the_bend():

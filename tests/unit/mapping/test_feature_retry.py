@@ -84,7 +84,7 @@ def test_a_lost_photo_finds_its_place_by_finer_features(first, finer, retry):
 
     found = retry(first)
 
-    assert asked == [("sift-dsp", [(k, LOST) for k in range(1, LOST)], OPTIONS.max_ratio)]
+    assert asked == [("sift-affine", [(k, LOST) for k in range(1, LOST)], OPTIONS.max_ratio)]
     assert posed_photo_ids(found.main.model) == [1, 2, 3, 4, 5, 6]
     assert found.run.workspace.database != first.run.workspace.database
     assert found.calibrated is first.calibrated  # it was known
@@ -157,7 +157,9 @@ def test_no_finer_features_where_all_photos_have_a_place(first, finer, retry, sy
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("chosen", [{"scene": {"without": ["finer-features"]}}, {"matching": {"features": "sift-dsp"}}])
+@pytest.mark.parametrize(
+    "chosen", [{"scene": {"without": ["finer-features"]}}, {"matching": {"features": "sift-affine"}}]
+)
 def test_no_finer_features_where_they_are_not_wanted(first, finer, retry, chosen):
     asked = finer()
     unasked = replace(first, run=replace(first.run, settings=Settings.from_mapping(chosen)))

@@ -156,7 +156,7 @@ def test_a_method_that_cannot_run_here_is_refused_before_any_work():
         return [FeatureMethod("gone", CORNERS.find, CORNERS.match, unavailable=lambda: "no such chip")]
 
     plugins = load_plugins([SimpleNamespace(sfm_features=sfm_features)], installed=False)
-    assert list(plugins.features)[:2] == ["sift", "sift-dsp"]
+    assert list(plugins.features)[:2] == ["sift", "sift-affine"]
     with pytest.raises(ConfigError, match="'gone' cannot be used here: no such chip"):
         plugins.feature_method("gone")
     with pytest.raises(ConfigError, match="no feature method is named 'surf'"):
