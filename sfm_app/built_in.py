@@ -16,7 +16,7 @@ if TYPE_CHECKING:  # OpenCV, which stereo needs, takes longer to load than an es
 
 SIFT_AFFINE_SUMMARY = "COLMAP's SIFT, slower: affine shape, fainter features; for plain things"
 SIFT_AFFINE_OPTIONS = {"estimate_affine_shape": True, "peak_threshold": 0.0007}
-"""A tenth of COLMAP's contrast. Chosen on dinoSparseRing, where half of all neighbors have no match with COLMAP's own."""
+"""A tenth of COLMAP's contrast. Chosen on dinoSparseRing, half of whose neighbors have no match with COLMAP's own."""
 
 
 def _make_depth_maps_on_cpu(task: "DepthTask") -> list[Rejected | None]:

@@ -155,7 +155,7 @@ class PanoramaViews:
 
     @classmethod
     def cover(cls, size: tuple[int, int], most_px: int) -> "PanoramaViews":
-        """Return views of a panorama (width, height) in its resolution, at most as many pixels as six of `most_px`^2."""
+        """Return views of a panorama (width, height) in its resolution, with at most 6 `most_px`^2 pixels together."""
         focal = size[0] / (2.0 * math.pi)
         side = 2.0 * focal * math.tan(math.radians(OPTIONS.field_deg / 2.0))
         return cls(size, max(1, round(min(side, most_px / math.sqrt(2.0)))), view_rotations())
