@@ -21,6 +21,7 @@ logger = logging.getLogger("sfm_app")
 
 SIDE_PX = 32
 """Side of the thumbnails that are compared."""
+COPY = "the same picture as"
 READERS = ("sfm-app", "pillow", "opencv-contrib-python-headless")
 """Packages that decode and measure."""
 
@@ -46,6 +47,8 @@ class OPTIONS:
     the width gives more; saving a picture again, smaller or as JPEG, gives less."""
     min_contrast: float = 4.0
     """Least contrast in gray levels of pictures that are compared."""
+    many_copies: float = 0.25
+    """Share of copies from which on the camera hardly moves."""
     blurred: float = 0.85
     """Least share of their slope that edges of a blurred photo keep after one more blur. Sharp photos: 0.33 to 0.70. At
     0.85, a blur of 0.8 % of the width or a smear of 2.5 %, 1 to 5 % of the inliers remain."""
@@ -170,10 +173,7 @@ def drop_duplicates(stats: Sequence[PhotoStats]) -> tuple[list[Photo], list[Unus
             original_of[k] = others[int(rms.argmin())]
         else:
             originals.add(k)
-    copies = [
-        UnusablePhoto(photos[k].label, f"the same picture as {photos[original_of[k]].label}")
-        for k in sorted(original_of)
-    ]
+    copies = [UnusablePhoto(photos[k].label, f"{COPY} {photos[original_of[k]].label}") for k in sorted(original_of)]
     return [photos[k] for k in sorted(originals)], copies
 
 

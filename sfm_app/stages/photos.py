@@ -17,7 +17,7 @@ from sfm_app.photos.decode import UnreadableError
 from sfm_app.photos.files import list_files, resolve_file
 from sfm_app.photos.masks import MASK_HINT, assign_masks, check_mask, lay_out_mask, mask_path, unused_masks
 from sfm_app.photos.probe import group_by_camera, read_photo, split_by_given_camera, with_one_zero
-from sfm_app.photos.selection import PhotoStats, drop_duplicates, drop_unusable, read_stats, write_stats
+from sfm_app.photos.selection import COPY, OPTIONS, PhotoStats, drop_duplicates, drop_unusable, read_stats, write_stats
 from sfm_app.photos.source import Source, assign_names, is_laid_out, lay_out
 from sfm_app.photos.video import MOST_PIXELS, CornerTracker, open_video, select_keyframes
 from sfm_app.products import read_copy_hashes, read_photo_list, write_photo_list
@@ -232,6 +232,12 @@ def _read_photos(
     stats, masked = attach_masks(good, folder, source, run)
     photos, useless = select_photos(stats, keep_low_quality=options.keep_low_quality)
     unusable = sorted(unreadable + masked + useless, key=lambda photo: photo.name)
+    copies = sum(COPY in photo.reason for photo in useless)
+    if copies >= OPTIONS.many_copies * len(stats) > 0:
+        run.progress.say(
+            f"{copies} of {len(stats)} photos show the same as others: copies, or the camera hardly moves; "
+            "walk around what is photographed"
+        )
     if len(photos) < 2:
         raise InputError(
             _too_few_message("the inputs" if source.named else str(folder), len(photos), unusable),
@@ -341,7 +347,7 @@ def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoS
 
 
 def _too_few_message(folder: str, usable: int, unusable: list[UnusablePhoto]) -> str:
-    reasons = Counter("copies of another" if "same picture" in photo.reason else photo.reason for photo in unusable)
+    reasons = Counter("copies of another" if COPY in photo.reason else photo.reason for photo in unusable)
     missing = [photo.name for photo in unusable if photo.reason == "missing"]  # from a list
     counts = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
     counts += f", such as {missing[0]}" if missing else ""

@@ -110,6 +110,17 @@ def test_a_panorama(folder, tmp_path):
     assert "do not determine it" in said and "the camera only turned" in said
 
 
+@pytest.mark.parametrize(("copies", "is_said"), [(1, False), (2, True)])
+def test_many_copies_mean_that_the_camera_hardly_moves(copies, is_said, courtyard, folder, tmp_path):
+    for path in courtyard.iterdir():
+        shutil.copy(path, folder)
+    for k in range(copies):
+        shutil.copy(folder / f"view_{k:02d}.jpg", folder / f"copy_{k}.jpg")
+    result = CliRunner().invoke(main, ["run", str(folder), "-o", str(tmp_path / "out"), "--until", "photos"])
+    said = " ".join(result.stderr.split())
+    assert (f"{copies} of {6 + copies} photos show the same as others" in said) == is_said, said
+
+
 def test_twenty_copies_of_one_photo(courtyard, folder, tmp_path):
     """Half of them byte by byte, the others compressed more or less."""
     with Image.open(courtyard / "view_02.jpg") as photo:
