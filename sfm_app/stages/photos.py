@@ -232,10 +232,10 @@ def _read_photos(
     stats, masked = attach_masks(good, folder, source, run)
     photos, useless = select_photos(stats, keep_low_quality=options.keep_low_quality)
     unusable = sorted(unreadable + masked + useless, key=lambda photo: photo.name)
-    copies = sum(COPY in photo.reason for photo in useless)
-    if copies >= OPTIONS.many_copies * len(stats) > 0:
+    alike = sum(COPY in photo.reason for photo in useless)
+    if alike >= OPTIONS.many_copies * len(stats) > 0:
         run.progress.say(
-            f"{copies} of {len(stats)} photos show the same as others: copies, or the camera hardly moves; "
+            f"{alike} of {len(stats)} photos show the same as others: copies, or the camera hardly moves; "
             "walk around what is photographed"
         )
     if len(photos) < 2:
