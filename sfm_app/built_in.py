@@ -42,7 +42,7 @@ def sfm_calibrators() -> Iterable[Calibrator]:
 
 @hookimpl
 def sfm_features() -> Iterable[FeatureMethod]:
-    """Return COLMAP's SIFT, with and without domain size pooling."""
+    """Return COLMAP's SIFT, with and without affine shape."""
     return [
         FeatureMethod(SIFT, summary="COLMAP's SIFT", sift={}),
         FeatureMethod(SIFT_AFFINE, summary=SIFT_AFFINE_SUMMARY, sift=SIFT_AFFINE_OPTIONS),

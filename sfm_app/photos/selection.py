@@ -22,6 +22,7 @@ logger = logging.getLogger("sfm_app")
 SIDE_PX = 32
 """Side of the thumbnails that are compared."""
 COPY = "the same picture as"
+"""Beginning of the reason of a copy, before the name of its original."""
 READERS = ("sfm-app", "pillow", "opencv-contrib-python-headless")
 """Packages that decode and measure."""
 
@@ -48,7 +49,7 @@ class OPTIONS:
     min_contrast: float = 4.0
     """Least contrast in gray levels of pictures that are compared."""
     many_copies: float = 0.25
-    """Share of copies from which on the camera hardly moves."""
+    """Share of copies from which on the camera hardly moves. Chosen by hand."""
     blurred: float = 0.85
     """Least share of their slope that edges of a blurred photo keep after one more blur. Sharp photos: 0.33 to 0.70. At
     0.85, a blur of 0.8 % of the width or a smear of 2.5 %, 1 to 5 % of the inliers remain."""

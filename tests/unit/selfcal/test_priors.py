@@ -205,6 +205,16 @@ def test_a_claim_comes_before_the_family():
     assert freed.mean[0, 0] == freed.mean[1, 0]
 
 
+def test_of_two_cameras_that_explain_the_same_only_one_is_freed():
+    """The pairs know the sum of both aspects alone: once one camera has taken it, nothing is left for the other."""
+    both = np.zeros(10)
+    both[[3, 8]] = 1.0
+    known = 1e6 * np.outer(both, both)
+    priors = CameraPriors(np.ones(2), np.full((2, 2, 5), np.nan))
+    evidence = Evidence(np.zeros((2, 5)), known, 0.2 * known @ both / 2.0, 1e6, priors)
+    assert evidence.choose(np.zeros((2, 4), np.bool_))[:, 1].sum() == 1
+
+
 class TurningEvidence(Evidence):
     """Always finds the opposite choice more probable."""
 
