@@ -130,8 +130,11 @@ def inverse_of_positive(S: FloatArray) -> FloatArray:
 
 
 def inverses_of_positive(S: FloatArray) -> FloatArray:
-    """Invert many small matrices (..., n, n)."""
-    return np.asarray(np.linalg.inv(lift_eigenvalues(S)), np.float64)
+    """Invert many small matrices (..., n, n), scaled to a unit diagonal, so that units do not matter."""
+    diagonal = np.einsum("...ii->...i", S)
+    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    pairs = scale[..., :, None] * scale[..., None, :]
+    return np.asarray(np.linalg.inv(lift_eigenvalues(S / pairs)) / pairs, np.float64)
 
 
 def solve_each(S: FloatArray, B: FloatArray) -> FloatArray:

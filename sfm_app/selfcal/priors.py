@@ -42,6 +42,8 @@ class PRIORS:
     held_factor: float = 1e-3
     """Factor on the prior deviation of a part that stays at its usual value: it is undetermined, or a lens that the
     settings exclude. Share of the latter, too; by hand."""
+    most_change: float = 1e6
+    """Largest ratio of two precisions at which an update of the posterior keeps ten digits. By double precision."""
     least_redundancy: float = 0.25
     """Least share of redundant constraints for freeing more: three pairs fit almost any center.
     docs/algorithms/zero-curves.md, 3; by hand."""
@@ -167,6 +169,9 @@ class Evidence:
         """Return mean step and covariance after one camera has changed its choice (Woodbury 1950)."""
         step, covariance = normal
         before, after = (self.priors.prior(choice, self.thetas) for choice in (free, best))
+        if np.abs(np.log(before.precision[camera] / after.precision[camera])).max() > np.log(PRIORS.most_change):
+            _, step, covariance = self.posterior(best)
+            return step, covariance
         more = after.precision[camera] - before.precision[camera]
         pull = after.precision[camera] * (after.mean - self.thetas)[camera]
         pull -= before.precision[camera] * (before.mean - self.thetas)[camera]
