@@ -131,6 +131,8 @@ def inverse_of_positive(S: FloatArray) -> FloatArray:
 
 def inverses_of_positive(S: FloatArray) -> FloatArray:
     """Invert many small matrices (..., n, n), scaled to a unit diagonal, so that units do not matter."""
+    if not np.isfinite(S).all():
+        raise NumericalError(*NOT_FINITE)
     diagonal = np.einsum("...ii->...i", S)
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     pairs = scale[..., :, None] * scale[..., None, :]
