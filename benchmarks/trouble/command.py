@@ -59,8 +59,8 @@ RENDER_LOCK = Lock()
 
 def load_folder(seed: int | str, cache: Path) -> tuple[Path, Truth, tuple[str, ...]]:
     """Return the photos of a seed or hard folder, their truth and its troubles; rendered on first use."""
-    plan = HARD[seed]() if isinstance(seed, str) else troubled_folder(seed)
-    photos, truth = cache / "trouble" / "photos" / f"{seed:>05}", cache / "trouble" / "truth" / f"{seed:>05}"
+    plan, name = (HARD[seed](), seed) if isinstance(seed, str) else (troubled_folder(seed), f"{seed:05d}")
+    photos, truth = cache / "trouble" / "photos" / name, cache / "trouble" / "truth" / name
     with RENDER_LOCK:
         if not truth.exists():  # written last
             shutil.rmtree(photos, ignore_errors=True)
