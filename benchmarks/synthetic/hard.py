@@ -9,23 +9,9 @@ import numpy as np
 from benchmarks.synthetic.detail_scenes import ornament, ornament_views
 from benchmarks.synthetic.houses import assemble
 from benchmarks.synthetic.trouble import PhotoDefects, TroubledFolder, mixed_cameras, with_distortion
+from sfm_app.synthetic import scenes
 from sfm_app.synthetic.cameras import ArcOptions, Camera, Views, arc, look_at, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions
-from sfm_app.synthetic.scenes import (
-    BRICK,
-    GREEN_MARBLE,
-    LEAVES,
-    LIMESTONE,
-    MARBLE,
-    PAINT,
-    PAVING,
-    POTTERY,
-    SANDSTONE,
-    TERRACOTTA,
-    WOOD,
-    statue,
-    statue_views,
-)
 from sfm_app.synthetic.shapes import Body, Shape, SyntheticScene, arch, ball, box, ground, revolve
 
 OPTIONS = PhotoOptions(supersampling=1, quality=85, exposure_ev=0.4)
@@ -34,8 +20,8 @@ SIZES = ((800, 600), (640, 480), (800, 533), (600, 800), (720, 405), (1024, 683)
 
 def statue_by_many() -> TroubledFolder:
     """Return 130 photos of the statue by 36 cameras of one size."""
-    views = statue_views(make_camera(800, 600, focal_widths=1.2), seed=5, photos=130)
-    return _folder("36 cameras", statue(), mixed_cameras(views, 36, 0.45, np.random.default_rng(56)))
+    views = scenes.statue_views(make_camera(800, 600, focal_widths=1.2), seed=5, photos=130)
+    return _folder("36 cameras", scenes.statue(), mixed_cameras(views, 36, 0.45, np.random.default_rng(56)))
 
 
 def equal_boxes() -> TroubledFolder:
@@ -46,15 +32,17 @@ def equal_boxes() -> TroubledFolder:
         return assemble([shape.move(at, turn_deg=turn) for at, turn in places], keep_texture=True)
 
     fronts = [
-        Body(copies(box(1.0, 1.5, 0.02, spacing=0.1).move((0.0, 0.0, 0.16))), replace(PAINT, scale=0.12)),
-        Body(copies(box(0.5, 0.4, 0.03, spacing=0.1).move((0.1, 0.8, 0.17))), replace(MARBLE, scale=0.12)),
-        Body(copies(box(0.7, 0.3, 0.03, spacing=0.1).move((-0.05, 0.2, 0.17))), replace(POTTERY, scale=0.06)),
+        Body(copies(box(1.0, 1.5, 0.02, spacing=0.1).move((0.0, 0.0, 0.16))), replace(scenes.PAINT, scale=0.12)),
+        Body(copies(box(0.5, 0.4, 0.03, spacing=0.1).move((0.1, 0.8, 0.17))), replace(scenes.MARBLE, scale=0.12)),
+        Body(copies(box(0.7, 0.3, 0.03, spacing=0.1).move((-0.05, 0.2, 0.17))), replace(scenes.POTTERY, scale=0.06)),
     ]
     sides = [
         Body(box(1.0, 1.5, 0.3, spacing=0.1).move(at, turn_deg=turn), material)
-        for (at, turn), material in zip(places, (WOOD, TERRACOTTA, GREEN_MARBLE, SANDSTONE), strict=True)
+        for (at, turn), material in zip(
+            places, (scenes.WOOD, scenes.TERRACOTTA, scenes.GREEN_MARBLE, scenes.SANDSTONE), strict=True
+        )
     ]
-    table = Body(ground((-3.0, 3.0), (-3.0, 3.0), 0.005), replace(WOOD, scale=0.5, contrast=0.15))
+    table = Body(ground((-3.0, 3.0), (-3.0, 3.0), 0.005), replace(scenes.WOOD, scale=0.5, contrast=0.15))
     walk = ArcOptions(
         photos=25, sweep_deg=150.0, distance=(4.6, 6.2), height=(1.0, 2.2), aim=(0.2, 0.7, -0.4), aim_spread=0.3,
         roll_deg=4.0,
@@ -98,20 +86,20 @@ def _palace() -> list[Body]:
     dome = np.array([[1.2, 0.0], [1.3, 0.4], [1.2, 0.9], [0.8, 1.4], [0.1, 1.7], [0.0, 2.0]])
     return [
         Body(assemble([part.move(turn_deg=90.0 * k) for k in range(4) for part in parts], keep_texture=True), material)
-        for parts, material in ((wall, BRICK), (trim, SANDSTONE), (posts, LIMESTONE))
+        for parts, material in ((wall, scenes.BRICK), (trim, scenes.SANDSTONE), (posts, scenes.LIMESTONE))
     ] + [
-        Body(revolve(dome, segments=64).move((0.0, 2.5, 0.0)), replace(MARBLE, scale=0.25)),
-        Body(box(3.8, 0.2, 3.8).move((0.0, 2.4, 0.0)), SANDSTONE),
+        Body(revolve(dome, segments=64).move((0.0, 2.5, 0.0)), replace(scenes.MARBLE, scale=0.25)),
+        Body(box(3.8, 0.2, 3.8).move((0.0, 2.4, 0.0)), scenes.SANDSTONE),
     ]
 
 
 def _garden(rng: np.random.Generator) -> list[Body]:
-    bodies = [Body(ground((-9.0, 9.0), (-9.0, 9.0), 0.02, spacing=0.2), PAVING)]
+    bodies = [Body(ground((-9.0, 9.0), (-9.0, 9.0), 0.02, spacing=0.2), scenes.PAVING)]
     for k in range(14):
         turn, far = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(4.2, 6.0)
         bush = ball(float(rng.uniform(0.2, 0.4)), bumps=0.1, seed=k)
         place = (far * math.cos(turn), 0.3, far * math.sin(turn))
-        bodies.append(Body(bush.move(place), replace(LEAVES, scale=0.055 * float(rng.uniform(0.7, 1.4)))))
+        bodies.append(Body(bush.move(place), replace(scenes.LEAVES, scale=0.055 * float(rng.uniform(0.7, 1.4)))))
     return bodies
 
 

@@ -152,9 +152,7 @@ def mixed_cameras(views: Views, count: int, reach: float, rng: Random) -> Views:
         if not names:
             continue
         camera = with_zoom(views.cameras[names[0]], math.exp(rng.uniform(-reach, reach)))
-        K = camera.K.copy()
-        K[:2, 2] += rng.normal(0.0, 0.008, 2) * (camera.width, camera.height)
-        views = views.with_camera(replace(camera, K=K), names)
+        views = views.with_camera(_with_moved_center(camera, rng.normal(0.0, 0.008, 2)), names)
     return views
 
 
@@ -424,6 +422,12 @@ def with_zoom(camera: Camera, factor: float) -> Camera:
     return replace(camera, K=K, lens=Lens(radial=(camera.radial * factor**2,)))
 
 
+def _with_moved_center(camera: Camera, shares: FloatArray) -> Camera:
+    K = camera.K.copy()
+    K[:2, 2] += shares * (camera.width, camera.height)
+    return replace(camera, K=K)
+
+
 def _draw_views(walk: str, place: str, camera: Camera, rng: Random) -> Views:
     count = int(rng.integers(PHOTOS[0], PHOTOS[1] + 1))
     longer = camera.K[0, 0] / max(camera.width, camera.height)
@@ -463,12 +467,10 @@ def _with_cameras(views: Views, drawn: set[str], rng: Random) -> Views:
     if "two cameras" in drawn:
         factor = float(rng.choice((0.65, 0.8, 1.25, 1.5)))
         center = rng.normal(0.0, 0.01, 2)
-        other = with_zoom(views.cameras[names[0]], factor)
-        K = other.K.copy()
-        K[:2, 2] += center * (other.width, other.height)
+        other = _with_moved_center(with_zoom(views.cameras[names[0]], factor), center)
         # alternating or one after the other, as with two photographers or one with two cameras
         turn = names[1::2] if rng.uniform() < 0.5 else names[: len(names) // 2]
-        views = views.with_camera(replace(other, K=K), turn)
+        views = views.with_camera(other, turn)
     if "zoom" in drawn:
         reach = float(rng.uniform(0.1, 0.4))
         for name in names:

@@ -233,17 +233,7 @@ def page(rows: Sequence[Row]) -> str:
         table([*trouble_rows(rows)]),
     ]
     if all(row["seed"] in HARD for row in rows):
-        columns = (
-            "seed",
-            "troubles",
-            "placed",
-            "AUC@5",
-            "features",
-            "cameras",
-            "map + BA",
-            "focal % after",
-            "worst in sd",
-        )
+        columns = ("seed", "placed", "AUC@5", "features", "cameras", "map + BA", "focal % after", "worst in sd")
         parts += ["## Hard folders; CPU seconds of features and pairs, cameras, map and bundle adjustment\n"]
         parts += [table(rows, columns)]
     parts += ["## Folders that failed, or whose camera is known and wrong\n", table(far, shown) if far else "None.\n"]

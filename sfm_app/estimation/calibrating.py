@@ -91,13 +91,13 @@ def find_intrinsics(matches: MatchGraph, views: ViewGraph, run: RunContext) -> I
     run.record(pairs_asked=len(sample.fits))
     cameras = _calibrate(matches, sample, run)
     for _ in range(OPTIONS.lens_rounds):
-        selected = select_inliers_through_lens(matches, sample, cameras, run)
+        selected = select_inliers_through_lens(matches, sample, _of_whole_photos(cameras, matches), run)
         if selected is sample:
             break
         before, cameras = cameras, _calibrate(matches, selected, run, cameras)
         if _agree(before, cameras):
             break
-    images = matches.images.values()
+    cameras, images = _of_whole_photos(cameras, matches), matches.images.values()
     for group, lens in views.lenses.items():  # they precede the fundamental matrices
         cameras.append(CalibratedCamera(group, tuple(image.id for image in images if image.group == group), lens))
     report_claims({camera.name: _claim(camera, matches) for camera in cameras}, run)
@@ -148,14 +148,18 @@ def sample_pairs(views: ViewGraph, photos: int) -> ViewGraph:
 def _calibrate(
     matches: MatchGraph, views: ViewGraph, run: RunContext, before: Sequence[CalibratedCamera] = ()
 ) -> list[CalibratedCamera]:
+    """Return the cameras of the pictures inside the bars of the photos."""
     options = run.settings.calibration
     calibrator = run.plugins.calibrator(options.calibrator)
     pairs = photo_pairs([image for image in matches.images.values() if image.group not in views.lenses], matches, views)
     # groups that the user defined are not split
     split = run.settings.photos.cameras == "auto"
-    cameras = calibrate_photo_set(
+    return calibrate_photo_set(
         pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=split, before=before
     )
+
+
+def _of_whole_photos(cameras: Sequence[CalibratedCamera], matches: MatchGraph) -> list[CalibratedCamera]:
     return [to_whole_photo(camera, matches.images[camera.photos[0]]) for camera in cameras]
 
 

@@ -59,8 +59,7 @@ def lift_eigenvalues(
     if not np.isfinite(S).all():
         raise NumericalError(*NOT_FINITE)
     if scale is None:
-        diagonal = np.einsum("...ii->...i", S)
-        scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+        scale = _unit_scale(S)
     pairs = scale[..., :, None] * scale[..., None, :]
     try:
         np.linalg.cholesky(S / pairs - least * np.eye(S.shape[-1]))
@@ -73,6 +72,12 @@ def lift_eigenvalues(
         return S
     raised = np.where(values < least, to, values)
     return np.where(singular, np.einsum("...ik,...k,...jk->...ij", vectors, raised, vectors) * pairs, S)
+
+
+def _unit_scale(S: FloatArray) -> FloatArray:
+    """Return (..., n) the units in which the diagonal of (..., n, n) is one; 1 where it is not positive."""
+    diagonal = np.einsum("...ii->...i", S)
+    return np.asarray(np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), np.float64)
 
 
 def solve_positive(S: FloatArray, B: FloatArray, options: SystemOptions = OPTIONS) -> FloatArray:
@@ -108,8 +113,7 @@ def _solve_by_cholesky(S: FloatArray, B: FloatArray) -> FloatArray:
     """Solve S X = B; where rounding has made S indefinite, the diagonal is raised until it no longer is."""
     from scipy.linalg import cho_factor, cho_solve
 
-    diagonal = np.diag(S)
-    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    scale = _unit_scale(S)
     unit = S / scale[:, None] / scale
     if not np.isfinite(unit).all():
         raise NumericalError(*NOT_FINITE)
@@ -133,8 +137,7 @@ def inverses_of_positive(S: FloatArray) -> FloatArray:
     """Invert many small matrices (..., n, n), scaled to a unit diagonal, so that units do not matter."""
     if not np.isfinite(S).all():
         raise NumericalError(*NOT_FINITE)
-    diagonal = np.einsum("...ii->...i", S)
-    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    scale = _unit_scale(S)
     pairs = scale[..., :, None] * scale[..., None, :]
     return np.asarray(np.linalg.inv(lift_eigenvalues(S / pairs)) / pairs, np.float64)
 
@@ -158,7 +161,7 @@ def _eliminate(S: FloatArray, B: FloatArray, least: float, to: float) -> FloatAr
     n = len(S)
     M = np.hstack([S, B])
     # a pivot is only rounding if it is tiny relative to its value before elimination
-    before = np.sqrt(np.where(np.diag(S) > 0.0, np.diag(S), 1.0))
+    before = _unit_scale(S)
     for start in range(0, n, 8):  # a few rows at once, without BLAS
         pivot = slice(start, min(start + 8, n))
         rest = np.r_[0:start, pivot.stop : n]

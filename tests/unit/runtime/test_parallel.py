@@ -2,8 +2,11 @@ import threading
 import time
 
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from sfm_app.runtime.parallel import make_executor, ordered_map, worker_count
+from sfm_app.progress import Progress
+from sfm_app.runtime.parallel import make_executor, open_executor, ordered_map, worker_count
+from sfm_app.settings import Settings
 
 pytestmark = pytest.mark.slow
 
@@ -16,6 +19,16 @@ def test_results_keep_the_order_of_the_items(workers):
 
     with make_executor(workers) as executor:
         assert list(ordered_map(executor, slow_first, range(7), ahead=3)) == [0, 10, 20, 30, 40, 50, 60]
+
+
+def test_linear_algebra_has_one_thread_during_a_run(tmp_path):
+    def threads():
+        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+    with threadpool_limits(2, user_api="blas"):
+        with open_executor(Settings(), tmp_path, Progress()):
+            assert threads() == {1}
+        assert threads() == {2}
 
 
 def test_no_more_than_ahead_items_are_under_way():

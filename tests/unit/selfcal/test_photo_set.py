@@ -40,6 +40,18 @@ def of_two(shots):
     return shots(8, 2, focal=[1000.0] * 4 + [1500.0] * 4)
 
 
+def test_cameras_of_other_inliers_are_adjusted_but_not_divided_again(shots):
+    def never(*_):
+        raise AssertionError("a group is calibrated again")
+
+    pairs, first = of_two(shots).as_set(["zoom"] * 8), cameras_of(of_two(shots).as_set(["zoom"] * 8))
+    fewer = replace(pairs, inliers=tuple(x[::2] for x in pairs.inliers))
+    again = calibrate_photo_set(fewer, never, OPTIONS, 0, together=True, before=first)
+    assert [(one.name, one.photos) for one in again] == [(one.name, one.photos) for one in first]
+    for one, other in zip(first, again, strict=True):
+        assert 0 < abs(other.found.focal_px - one.found.focal_px) < 3 * other.found.spread["fx"]
+
+
 @pytest.mark.parametrize("together", [True, False])
 @pytest.mark.parametrize("count", [1, 5])
 def test_photos_without_pairs_have_the_usual_guess(count, together):
