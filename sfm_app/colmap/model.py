@@ -1,6 +1,6 @@
 """COLMAP's sparse model: build, divide and move it, read it as arrays, as a scene, and as figures of its photos."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypedDict
@@ -122,7 +122,7 @@ def color_points(model: Reconstruction, photo_dir: Path, workers: int) -> None:
     run_in_daemon_thread(lambda: model.extract_colors_for_all_images(photo_dir, num_threads=workers))
 
 
-def submodel(model: Reconstruction, photos: Sequence[int]) -> Reconstruction:
+def submodel(model: Reconstruction, photos: Collection[int]) -> Reconstruction:
     """Return a copy of a model with only the given photos, and the points that at least two of them see."""
     part, members = Reconstruction(model), set(photos)
     for image in posed_images(model):

@@ -22,8 +22,8 @@ from sfm_app.numerical import FAILURES, Json
 from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.posegraph.look_alikes import OPTIONS as LOOK_ALIKES
 from sfm_app.posegraph.look_alikes import cell_numbers, group_doubted_pairs, is_matched_again, is_well_inside
-from sfm_app.posegraph.rotations import find_cut
-from sfm_app.types import LookAlikes, MatchGraph, PairId, PoseGraph
+from sfm_app.posegraph.rotations import find_cut, partners_of
+from sfm_app.types import Evidence, LookAlikes, MatchGraph, PairId, PoseGraph
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 # Recognized look-alikes: their matches are hidden from mapping, and reported.
@@ -147,6 +147,12 @@ class OVERLAPS:
     """Non-overlapping pairs that prove a false join. Chosen by hand."""
     min_photos: int = 3
     """Photos on either side of a false join. Chosen by hand."""
+    min_own_share: float = 0.35
+    """Share of the expected cells below which a photo may be misplaced. Measured: photos of 18 real sets have 0.45 and
+    more, those on the wrong side of lego50 0.28 and less, the most blurred of rendered ones 0.28."""
+    min_agreeing: float = 0.9
+    """Share of its inliers that agree with points above which it is not. Measured: the former have 0.87 and less, the
+    latter 1."""
     max_passes: int = 3
     """Times that photos are mapped again without more look-alikes. Chosen by hand."""
     min_missing: float = 0.5
@@ -182,6 +188,15 @@ class PosedPhotoPoints:
     """(M, 3) from its center to them, of length 1."""
     distances: FloatArray
     """(M,) from its center to them."""
+    featured: BoolArray
+    """By cell, whether it has as many features as an expected cell has points."""
+
+    def rows_alike(self, there: "PosedPhotoPoints", points: FloatArray) -> IndexArray:
+        """Return the numbers of its points with enough witnesses that look alike from another photo."""
+        rays = points[self.witnessed] - there.center
+        lengths = np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
+        size_ratios = lengths / self.distances * self.focal_px / there.focal_px
+        return self.witnessed[is_matched_again(size_ratios, (self.rays * rays).sum(axis=1) / lengths)]
 
 
 def find_expected_overlaps(model: Reconstruction) -> dict[PairId, ExpectedOverlap]:
@@ -223,13 +238,21 @@ def _posed_photo_points(
     rays = points[rows] - center
     distances = np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
     cells = cell_numbers(x, camera.width, camera.height)
-    reach = np.full((LOOK_ALIKES.cells + 1) ** 2, -1.0)
-    for cell in np.unique(cells):
-        reach[cell] = np.median(distances[cells == cell])
+    reach = _cell_medians(distances, cells)
+    features = np.array([one.xy for one in image.points2D], np.float64).clip(0.0, [camera.width - 1, camera.height - 1])
+    counts = np.bincount(cell_numbers(features, camera.width, camera.height), minlength=len(reach))
     return PosedPhotoPoints(
         camera, focal_px(model, photo), np.asarray(image.cam_from_world().matrix()), center, rows, reach,
-        rows[often], (rays / distances[:, None])[often], distances[often],
+        rows[often], (rays / distances[:, None])[often], distances[often], counts >= LOOK_ALIKES.min_cell_points,
     )  # fmt: skip
+
+
+def _cell_medians(distances: FloatArray, cells: IndexArray) -> FloatArray:
+    """Return by cell the median of the distances (N,) in it; -1 without any."""
+    medians = np.full((LOOK_ALIKES.cells + 1) ** 2, -1.0)
+    for cell in np.unique(cells):
+        medians[cell] = np.median(distances[cells == cell])
+    return medians
 
 
 def _neighbors(posed: Mapping[int, PosedPhotoPoints]) -> Iterator[PairId]:
@@ -252,21 +275,73 @@ def _neighbors(posed: Mapping[int, PosedPhotoPoints]) -> Iterator[PairId]:
 
 def _compare(here: PosedPhotoPoints, there: PosedPhotoPoints, points: FloatArray) -> tuple[int, int]:
     """Count the cells of a photo that should show points of another one, and those of them that do."""
-    rays = points[here.witnessed] - there.center
-    lengths = np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
-    size_ratios = lengths / here.distances * here.focal_px / there.focal_px
-    is_matched = is_matched_again(size_ratios, (here.rays * rays).sum(axis=1) / lengths)
-    rows, lengths = here.witnessed[is_matched], lengths[is_matched]
+    rows, cells, distances = _expected_points(here.rows_alike(there, points), there, points)
+    is_visible = distances < OVERLAPS.behind * there.reach[cells]
+    expected, shared = _shared_cells(rows[is_visible], cells[is_visible], there)
+    return len(expected), int(np.count_nonzero(shared))
+
+
+def _expected_points(
+    rows: IndexArray, there: PosedPhotoPoints, points: FloatArray
+) -> tuple[IndexArray, IndexArray, FloatArray]:
+    """Return those of points `rows` that project into a photo, their cells, and their distances from its center."""
     inside = points[rows] @ there.pose[:, :3].T + there.pose[:, 3]
     x = np.asarray(there.camera.img_from_cam(inside), np.float64).reshape(-1, 2)
     is_inside = is_well_inside(x, there.camera.width, there.camera.height)
-    rows, cells = rows[is_inside], cell_numbers(x[is_inside], there.camera.width, there.camera.height)
-    is_visible = lengths[is_inside] < OVERLAPS.behind * there.reach[cells]
-    rows, cells = rows[is_visible], cells[is_visible]
+    cells = cell_numbers(x[is_inside], there.camera.width, there.camera.height)
+    return rows[is_inside], cells, np.linalg.norm(inside[is_inside], axis=1)
+
+
+def _shared_cells(rows: IndexArray, cells: IndexArray, there: PosedPhotoPoints) -> tuple[IndexArray, BoolArray]:
+    """Return the cells with enough of the expected points `rows`, and a mask of those where the photo has one."""
     expected, counts = np.unique(cells, return_counts=True)
     expected = expected[counts >= LOOK_ALIKES.min_cell_points]
-    shared = cells[np.isin(rows, there.rows, assume_unique=True)]
-    return len(expected), int(np.count_nonzero(np.isin(expected, shared)))
+    return expected, np.isin(expected, cells[np.isin(rows, there.rows, assume_unique=True)])
+
+
+# A photo on the wrong side of a symmetric object: few matches fit there, others contradict them, and most of what
+# its neighbors see is missing in it. A blurred photo in its place misses as much, but nothing contradicts it.
+
+
+def find_misplaced(model: Reconstruction, evidence: Evidence, max_error_px: float) -> dict[int, float]:
+    """Return by photo the missing share of what it should show, where that and its matches contradict its pose."""
+    with translate_errors("reading points"):
+        points, photos = _read_posed_photos(model)
+        neighbors = partners_of(_neighbors(photos))
+        shares = {
+            photo: _own_share(there, [photos[other].rows_alike(there, points) for other in neighbors[photo]], points)
+            for photo, there in photos.items() if photo in neighbors
+        }  # fmt: skip
+        return {
+            photo: 1.0 - share for photo, share in shares.items()
+            if share < OVERLAPS.min_own_share
+            and _agreeing_share(photo, model, evidence, max_error_px) < OVERLAPS.min_agreeing
+        }  # fmt: skip
+
+
+def _own_share(there: PosedPhotoPoints, alike: Sequence[IndexArray], points: FloatArray) -> float:
+    """Return in which share of the cells with features and with points of its neighbors a photo has one of these."""
+    rows, cells, distances = _expected_points(np.unique(np.concatenate(alike)), there, points)
+    is_visible = (distances < OVERLAPS.behind * _cell_medians(distances, cells)[cells]) & there.featured[cells]
+    expected, shared = _shared_cells(rows[is_visible], cells[is_visible], there)
+    return float(shared.mean()) if len(expected) >= LOOK_ALIKES.min_cells else 1.0
+
+
+def _agreeing_share(photo: int, model: Reconstruction, evidence: Evidence, max_error_px: float) -> float:
+    """Return the share of the inliers of a photo, among those whose partner has a point, that see this point."""
+    image, errors = model.images[photo], [np.zeros(0)]
+    for pair, fit in evidence.views.fits.items():
+        if photo in pair and model.exists_image(other := pair[pair[0] == photo]) and model.images[other].has_pose:
+            here = pair.index(photo)
+            x = evidence.matches.points(pair)[here][fit.inliers]
+            seen = model.images[other].points2D
+            ends = [seen[k] for k in evidence.matches.matches[pair][fit.inliers, 1 - here]]
+            known = np.array([end.has_point3D() for end in ends], np.bool_)
+            X = [model.points3D[end.point3D_id].xyz for end in ends if end.has_point3D()]
+            inside = np.array(X, np.float64).reshape(-1, 3) @ image.cam_from_world().matrix()[:, :3].T
+            projected = model.cameras[image.camera_id].img_from_cam(inside + image.cam_from_world().translation)
+            errors.append(np.linalg.norm(np.asarray(projected).reshape(-1, 2) - x[known], axis=1))
+    return float(np.mean(np.concatenate(errors) < max_error_px)) if len(errors) > 1 else 1.0
 
 
 logger = logging.getLogger("sfm_app")

@@ -12,7 +12,7 @@ from itertools import chain
 from typing import NamedTuple
 
 from sfm_app.camera.models import GUESSED_FOCAL, guessed_camera_matrix
-from sfm_app.colmap.backend import run_interruptible, translate_errors
+from sfm_app.colmap.backend import Reconstruction, run_interruptible, translate_errors
 from sfm_app.colmap.database import keep_raw_matches, write_calibrations, write_pose_graph
 from sfm_app.colmap.mapping import copy_database, map_with_colmap_defaults
 from sfm_app.colmap.model import posed_photo_ids
@@ -30,9 +30,16 @@ from sfm_app.mapping.attempt import (
     model_poses,
     pairs_to_map,
 )
-from sfm_app.mapping.look_alikes import OVERLAPS, joined_pairs, judge_places, with_earlier_look_alikes, with_false_joins
+from sfm_app.mapping.look_alikes import (
+    OVERLAPS,
+    find_misplaced,
+    joined_pairs,
+    judge_places,
+    with_earlier_look_alikes,
+    with_false_joins,
+)
 from sfm_app.mapping.parts import map_in_parts, part_size, parts_suffice
-from sfm_app.mapping.splits import split_attempt
+from sfm_app.mapping.splits import part_of, split_attempt
 from sfm_app.numerical import Json
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
 from sfm_app.runtime.context import RunContext
@@ -168,6 +175,29 @@ def _outcome_of(groups: Sequence[MappedGroup], start: Outcome) -> Outcome:
         cuts=tuple(", ".join(names(sorted(posed_photo_ids(part.model)))) for part in cut),
         trials=tuple(chain(*(group.trials() for group in groups))),
     )
+
+
+def without_misplaced(outcome: Outcome, adjusted: Sequence[Reconstruction]) -> Outcome:
+    """Leave out photos that are misplaced in the adjusted models, and the pairs that put them there.
+
+    Return the same outcome where there are none. Most photos define the model, and stay in it.
+    """
+    max_error_px = MAPPING.loose_factor * outcome.run.settings.epipolar.max_error_px
+    models, joins = list(outcome.models), list[LookAlikes]()
+    for number, (attempt, model) in enumerate(zip(outcome.models, adjusted, strict=True)):
+        misplaced = find_misplaced(model, outcome.evidence, max_error_px)
+        if not 0 < len(misplaced) < attempt.photos / 2:
+            continue
+        models[number] = part_of(attempt, set(posed_photo_ids(attempt.model)) - misplaced.keys())
+        for photo, missing in misplaced.items():
+            pairs = {
+                pair for pair, one in attempt.explained.items() if photo in pair and one.matches > one.contradicted
+            }
+            joins.append(LookAlikes(tuple(sorted(pairs & outcome.graph.poses.keys())), missing))
+    if not joins:
+        return outcome
+    graph = with_false_joins(outcome.graph, [join for join in joins if join.pairs])
+    return replace(outcome, models=tuple(models), graph=graph)
 
 
 RIVAL, RIVAL_FOLDER, RIVAL_NOTE = "colmap", "rival", "COLMAP's default pipeline"

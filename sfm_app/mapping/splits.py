@@ -1,7 +1,7 @@
 """Cut models at joins that matches contradict, and find loose joins."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -70,13 +70,14 @@ def split_attempt(attempt: Attempt, run: RunContext) -> list[Attempt]:
         return [attempt]
     large = [part for number, part in enumerate(parts) if len(part) >= (2 if number == 0 else MAPPING.min_photos)]
     with translate_errors("dividing a model"):
-        return [_part(attempt, part) for part in large]
+        return [part_of(attempt, part) for part in large]
 
 
-def _part(attempt: Attempt, photos: Sequence[int]) -> Attempt:
+def part_of(attempt: Attempt, photos: Iterable[int]) -> Attempt:
+    """Return an attempt with only the given photos."""
     members = set(photos)
     explained = {pair: pair_support for pair, pair_support in attempt.explained.items() if members.issuperset(pair)}
-    return replace(attempt, model=submodel(attempt.model, photos), explained=explained)
+    return replace(attempt, model=submodel(attempt.model, members), explained=explained)
 
 
 # Loose scales. The relative scale of a third photo comes from points that all three see. Where a part shares hardly any

@@ -17,7 +17,7 @@ from sfm_app.mapping.attempt import unregistered_reasons
 from sfm_app.mapping.hypotheses import reconstruct
 from sfm_app.mapping.look_alikes import jumps, look_alike_entries
 from sfm_app.mapping.new_photos import GROWN, map_new_photos
-from sfm_app.mapping.passes import Outcome
+from sfm_app.mapping.passes import Outcome, without_misplaced
 from sfm_app.mapping.rolling_shutter import follow_shutter
 from sfm_app.mapping.splits import weakly_joined_parts
 from sfm_app.numerical import Json
@@ -82,6 +82,10 @@ def _finish_scene(outcome: Outcome, run: RunContext) -> Scene:
     cues = submit_cue_extraction([attempt.model for attempt in outcome.models], matches, run)
     names = {image.name: outcome.evidence.camera_name(photo) for photo, image in matches.images.items()}
     adjusted, shutter = _adjust_models(outcome, names, run)
+    placed = without_misplaced(outcome, [one.model for one in adjusted])
+    if placed is not outcome and run.settings.scene.tries("look-alikes"):
+        outcome = placed
+        adjusted, shutter = _adjust_models(outcome, names, run)
     models = [one.model for one in adjusted]
     with translate_errors("reading colors"):
         for model in models:

@@ -12,6 +12,7 @@ from sfm_app.mapping.look_alikes import (
     ExpectedOverlap,
     find_expected_overlaps,
     find_false_joins,
+    find_misplaced,
     find_non_overlapping,
     joined_pairs,
     judge_places,
@@ -210,6 +211,34 @@ def test_photos_far_apart_do_not_meet(walls):
     walls.add_walk(range(1, 7), np.linspace(3, 6, 6), walls.add_points(0, 9, seed=1))
     walls.add_walk(range(11, 17), np.linspace(30, 33, 6), walls.add_points(27, 36, seed=2))
     assert all((a < 10) == (b < 10) for a, b in find_expected_overlaps(walls.finish()[0]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("common", "wrong", "is_misplaced"),
+    [(12, 6, True), (12, 0, False), (400, 60, False)],
+    ids=["contradicted", "blurred: nothing contradicts it", "it shows what it should"],
+)
+def test_a_photo_that_lacks_what_it_should_show_is_misplaced_if_its_matches_contradict_it(
+    walls, common, wrong, is_misplaced
+):
+    wall, other = walls.add_points(0, 12, seed=1), walls.add_points(0, 12, seed=2)
+    walls.add_walk(range(1, 13), np.linspace(3, 9, 12), wall)
+    near = wall[np.abs(walls.points[wall, 0] - 6.0) < 2.5]
+    walls.add_walk([21], [6.0], np.concatenate([near[:common], other]))
+    model, _ = walls.finish()
+    photos = {key: [end.point3D_id for end in model.images[key].points2D] for key in (6, 21)}
+    agreeing = [(photos[6].index(key), row) for row, key in enumerate(photos[21]) if key in photos[6]]
+    rows = np.array([*agreeing, *((k, len(photos[21]) - 1 - k) for k in range(wrong))], np.uint32)
+    matches = MatchGraph(
+        {key: MatchedImage(key, f"{key:03d}.jpg", "camera", WIDTH, HEIGHT) for key in photos},
+        {key: np.array([end.xy for end in model.images[key].points2D]) for key in photos},
+        {(6, 21): rows},
+    )
+    fit = EpipolarFit(np.eye(3), np.ones(len(rows), bool), np.ones(len(rows)), 1, 0.1)
+    found = find_misplaced(model, Evidence(matches, ViewGraph({(6, 21): fit}, {}), Intrinsics({})), 4.0)
+    assert found.keys() == ({21} if is_misplaced else set())
+    assert all(0.65 < missing < 1.0 for missing in found.values())
 
 
 def two_streets(walls, length=24, alike=(10.0, 14.0)):
