@@ -60,13 +60,14 @@ def peak_cameras(consensus: Consensus) -> list[FloatArray]:
 
 def divide_photos(
     tables: VoteTables, photos: Sequence[PairId], starts: Sequence[FloatArray], seed: int,
-    known: Mapping[int, int] | None = None,
+    known: Mapping[int, int] | None = None, *, mixed: bool = False,
 ) -> Division:  # fmt: skip
     """Divide photos of one size among cameras that share all but the focal.
 
     The tables are of undistorted pairs, in longer sides from the middle of the photo; their members are not used. The
     starts (5,) give center and aspect, and the usual ones are another start. The seed divides the pairs into folds.
-    `known` cameras by photo are compared with a camera per photo, in place of one camera and two.
+    `known` cameras by photo are compared with a camera per photo, in place of one camera and two. In a `mixed` folder,
+    photos of other sizes have a camera each: here this is as likely as not, and need not explain pairs of look-alikes.
     """
     rows = np.linspace(0, len(photos) - 1, min(len(photos), DIVISION.most_pairs)).astype(np.int64)
     everyone = sorted({photo for pair in photos for photo in pair})
@@ -76,18 +77,20 @@ def divide_photos(
     others = (FocalGrid(tables, rows, theta, members) for theta in starts)
     shared = max(chain([usual], others), key=lambda grid: grid.fit(few))
     fold = np.random.default_rng(seed).permutation(len(rows)) % DIVISION.folds
-    two = few if known else shared.two_cameras()
+    two = few if known or mixed else shared.two_cameras()
     hypotheses = (
         (two, log_probability(two) - log_probability(few)),
-        (np.arange(len(everyone)), -float(np.log(CONSENSUS.rarity))),
+        (np.arange(len(everyone)), 0.0 if mixed else -float(np.log(CONSENSUS.rarity))),
     )
-    labels, is_doubtful = _choose(few, hypotheses, {shared, usual}, fold)
+    max_remaining_share = 1.0 if mixed else DIVISION.max_remaining_share
+    labels, is_doubtful = _choose(few, hypotheses, {shared, usual}, fold, max_remaining_share)
     return Division(dict(zip(everyone, labels.tolist(), strict=True)), shared.cameras(labels), is_doubtful)
 
 
 def _choose(
-    labels: IndexArray, hypotheses: Iterable[tuple[IndexArray, float]], grids: "set[FocalGrid]", fold: IndexArray
-) -> tuple[IndexArray, bool]:
+    labels: IndexArray, hypotheses: Iterable[tuple[IndexArray, float]], grids: "set[FocalGrid]", fold: IndexArray,
+    max_remaining_share: float,
+) -> tuple[IndexArray, bool]:  # fmt: skip
     """Return the most probable cameras (N,), and whether more are possible; a hypothesis has its log-prior odds.
 
     A focal of its own also absorbs errors that the pairs of a photo share: more cameras must explain most of the rest.
@@ -100,7 +103,7 @@ def _choose(
         if after - before + log_prior <= doubt or np.array_equal(more, labels):
             continue
         before, after = (max(grid.held_out(one, fold) for grid in grids) for one in (labels, more))
-        if most - after > DIVISION.max_remaining_share * (most - before):
+        if most - after > max_remaining_share * (most - before):
             continue
         log_odds = after - before + log_prior
         is_doubtful = log_odds <= 0.0 and (is_doubtful or log_odds > doubt)

@@ -103,18 +103,24 @@ def _split_and_calibrate(
 ) -> list[CalibratedCamera]:
     """Divide groups whose photos disagree, and calibrate all."""
     families = _mixed_padded_groups(whole, pairs, seed)
-    parts = (
+    parts = [
         _split_by_photo(camera, len(whole) + families[camera.name], pairs)
         if camera.name in families
         else _split_group(camera, number, pairs, options, seed)
         for number, camera in enumerate(whole)
-    )
+    ]
+    several = [number for number, camera in enumerate(whole) if len(camera.photos) > 1]
+    undivided = [number for number in several if len(parts[number]) < len(whole[number].photos)]
+    if 2 * len(undivided) <= len(several):
+        for number in undivided:
+            parts[number] = _split_group(whole[number], number, pairs, options, seed, mixed=True)
     return _calibrate_from_all_pairs(list(chain.from_iterable(parts)), pairs, options)
 
 
 def _split_group(
-    camera: CalibratedCamera, number: int, pairs: PhotoPairs, options: CalibrationSettings, seed: int
-) -> list[CalibratedCamera]:
+    camera: CalibratedCamera, number: int, pairs: PhotoPairs, options: CalibrationSettings, seed: int, *,
+    mixed: bool = False,
+) -> list[CalibratedCamera]:  # fmt: skip
     """Return the camera itself, the cameras that its photos are divided among, or one for each photo."""
     calibration = camera.found
     own = undistort_pairs(pairs.to_camera_pairs(camera.photos), calibration)
@@ -127,7 +133,7 @@ def _split_group(
         starts.append(np.append(parameters_from_calibration(calibration, side)[:4], 0.0))
     tables = VoteTables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)
     photos = [own.photos[ready.indices[k]] for k in tables.indices]
-    division = divide_photos(tables, photos, starts, seed)
+    division = divide_photos(tables, photos, starts, seed, mixed=mixed)
     if division.is_camera_per_photo:
         return _split_by_photo(camera, number, pairs)
     if len(division.cameras) == 1:

@@ -16,12 +16,12 @@ UNLIKE = 1000 * np.geomspace(0.7, 1.75, 10)
 """Ten focals, the last 2.5 times the first."""
 
 
-def divide(made, Fs=None, *, kept=None, known=None, seed=0):
+def divide(made, Fs=None, *, kept=None, known=None, seed=0, mixed=False):
     """The division of photos of 1000 x 750 pixels; `kept`: pairs that are there."""
     Fs = MIDDLE.T @ (made.pairs.Fs if Fs is None else Fs) @ MIDDLE
     rows = [k for k in range(len(Fs)) if kept is None or kept(*made.pairs.photos[k])]
     tables = VoteTables(Fs[rows], np.zeros((len(rows), 2), np.int64), made.pairs.weights[rows])
-    return divide_photos(tables, [made.pairs.photos[k] for k in rows], [np.zeros(5)], seed, known)
+    return divide_photos(tables, [made.pairs.photos[k] for k in rows], [np.zeros(5)], seed, known, mixed=mixed)
 
 
 def labels_of(division):
@@ -72,6 +72,19 @@ def test_errors_that_the_pairs_of_a_photo_share_do_not_divide_photos(shots):
             if pair[0] == made.pairs.photos[0][0] and rng.random() < 0.7:
                 Fs[k] = made.pairs.Fs[k] @ longer
         assert set(divide(made, Fs).labels.values()) == {0}
+
+
+@slow
+@pytest.mark.parametrize("focal", [UNLIKE, 1000.0], ids=["a camera each", "one camera"])
+def test_in_a_mixed_folder_photos_with_many_wrong_pairs_are_divided_if_focals_differ(shots, focal):
+    """Equal sides of a building match, so that no cameras explain most of the rest."""
+    divided = {True: 0, False: 0}
+    for seed in range(4):
+        made = shots(10, 350 + seed, focal=focal, points=120)
+        Fs = with_wrong(made.pairs.Fs, 0.65, np.random.default_rng(seed))
+        for mixed in divided:
+            divided[mixed] += divide(made, Fs, mixed=mixed).is_camera_per_photo
+    assert divided[True] == (4 if focal is UNLIKE else 0) and divided[False] <= 2 * divided[True] / 4
 
 
 @slow
