@@ -304,7 +304,7 @@ def _shared_cells(rows: IndexArray, cells: IndexArray, there: PosedPhotoPoints) 
 
 
 def find_misplaced(model: Reconstruction, evidence: Evidence, max_error_px: float) -> dict[int, float]:
-    """Return by photo the missing share of what it should show, where that and its matches contradict its pose."""
+    """Return the photos that lack most expected points and that inliers contradict, with the missing share, 0 to 1."""
     with translate_errors("reading points"):
         points, photos = _read_posed_photos(model)
         neighbors = partners_of(_neighbors(photos))
@@ -320,7 +320,10 @@ def find_misplaced(model: Reconstruction, evidence: Evidence, max_error_px: floa
 
 
 def _own_share(there: PosedPhotoPoints, alike: Sequence[IndexArray], points: FloatArray) -> float:
-    """Return in which share of the cells with features and with points of its neighbors a photo has one of these."""
+    """Return the share of the expected cells in which a photo has an expected point; 1 where it has few such cells.
+
+    Cells with points of its neighbors and with features of its own are expected.
+    """
     rows, cells, distances = _expected_points(np.unique(np.concatenate(alike)), there, points)
     is_visible = (distances < OVERLAPS.behind * _cell_medians(distances, cells)[cells]) & there.featured[cells]
     expected, shared = _shared_cells(rows[is_visible], cells[is_visible], there)
@@ -328,7 +331,7 @@ def _own_share(there: PosedPhotoPoints, alike: Sequence[IndexArray], points: Flo
 
 
 def _agreeing_share(photo: int, model: Reconstruction, evidence: Evidence, max_error_px: float) -> float:
-    """Return the share of the inliers of a photo, among those whose partner has a point, that see this point."""
+    """Return the share of the inliers of a photo that lie where the points of their partners project, 0 to 1."""
     image, errors = model.images[photo], [np.zeros(0)]
     for pair, fit in evidence.views.fits.items():
         if photo in pair and model.exists_image(other := pair[pair[0] == photo]) and model.images[other].has_pose:

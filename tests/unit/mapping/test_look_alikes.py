@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
+from sfm_app.mapping import passes
 from sfm_app.mapping.attempt import Attempt, PairSupport
 from sfm_app.mapping.look_alikes import (
     OVERLAPS,
     ExpectedOverlap,
     find_expected_overlaps,
     find_false_joins,
-    find_misplaced,
     find_non_overlapping,
     joined_pairs,
     judge_places,
@@ -21,6 +21,8 @@ from sfm_app.mapping.look_alikes import (
     sides,
     with_earlier_look_alikes,
 )
+from sfm_app.mapping.passes import Outcome, without_misplaced
+from sfm_app.settings import Settings
 from sfm_app.types import EpipolarFit, Evidence, Intrinsics, LookAlikes, MatchedImage, MatchGraph, PoseGraph, ViewGraph
 
 COUNTS = {(1, 2): 90, (1, 11): 80, (2, 12): 70, (2, 11): 20, (11, 12): 90}
@@ -219,14 +221,14 @@ def test_photos_far_apart_do_not_meet(walls):
     [(12, 6, True), (12, 0, False), (400, 60, False)],
     ids=["contradicted", "blurred: nothing contradicts it", "it shows what it should"],
 )
-def test_a_photo_that_lacks_what_it_should_show_is_misplaced_if_its_matches_contradict_it(
+def test_a_photo_that_lacks_what_it_should_show_is_left_out_if_its_matches_contradict_it(
     walls, common, wrong, is_misplaced
 ):
     wall, other = walls.add_points(0, 12, seed=1), walls.add_points(0, 12, seed=2)
     walls.add_walk(range(1, 13), np.linspace(3, 9, 12), wall)
     near = wall[np.abs(walls.points[wall, 0] - 6.0) < 2.5]
     walls.add_walk([21], [6.0], np.concatenate([near[:common], other]))
-    model, _ = walls.finish()
+    model, explained = walls.finish()
     photos = {key: [end.point3D_id for end in model.images[key].points2D] for key in (6, 21)}
     agreeing = [(photos[6].index(key), row) for row, key in enumerate(photos[21]) if key in photos[6]]
     rows = np.array([*agreeing, *((k, len(photos[21]) - 1 - k) for k in range(wrong))], np.uint32)
@@ -236,9 +238,31 @@ def test_a_photo_that_lacks_what_it_should_show_is_misplaced_if_its_matches_cont
         {(6, 21): rows},
     )
     fit = EpipolarFit(np.eye(3), np.ones(len(rows), bool), np.ones(len(rows)), 1, 0.1)
-    found = find_misplaced(model, Evidence(matches, ViewGraph({(6, 21): fit}, {}), Intrinsics({})), 4.0)
-    assert found.keys() == ({21} if is_misplaced else set())
-    assert all(0.65 < missing < 1.0 for missing in found.values())
+    evidence = Evidence(matches, ViewGraph({(6, 21): fit}, {}), Intrinsics({}))
+    poses = dict.fromkeys([(5, 6), (6, 7), (6, 21)])
+    run = SimpleNamespace(settings=Settings())
+    before = Outcome(
+        (Attempt("incremental", model, explained, ""),), PoseGraph(poses, {}, ()), evidence, Intrinsics({}), run
+    )
+
+    after = without_misplaced(before, [model])
+
+    assert (after is before) is not is_misplaced
+    assert after.photos == before.photos - is_misplaced == 13 - is_misplaced
+    assert set(after.graph.dropped) == ({(6, 21)} if is_misplaced else set())
+    assert all(0.65 < join.missing < 1.0 for join in after.graph.look_alikes)
+
+
+@pytest.mark.slow
+def test_most_photos_of_a_model_stay_in_it(walls, monkeypatch):
+    walls.add_walk(range(1, 5), np.linspace(3, 6, 4), walls.add_points(0, 9, seed=1))
+    model, explained = walls.finish()
+    evidence = Evidence(MatchGraph({}, {}, {}), ViewGraph({}, {}), Intrinsics({}))
+    attempt, run = Attempt("incremental", model, explained, ""), SimpleNamespace(settings=Settings())
+    before = Outcome((attempt,), PoseGraph({}, {}, ()), evidence, Intrinsics({}), run)
+    for misplaced, left in (({1: 0.9}, 3), ({1: 0.9, 2: 0.9}, 4)):
+        monkeypatch.setattr(passes, "find_misplaced", lambda *_, found=misplaced: found)
+        assert without_misplaced(before, [model]).photos == left
 
 
 def two_streets(walls, length=24, alike=(10.0, 14.0)):
