@@ -177,11 +177,17 @@ def _outcome_of(groups: Sequence[MappedGroup], start: Outcome) -> Outcome:
     )
 
 
+MISPLACED = "at the place of its matches, most expected points are missing; perhaps it shows an equal side elsewhere"
+"""Why a photo was left out."""
+
+
 def without_misplaced(outcome: Outcome, adjusted: Sequence[Reconstruction]) -> Outcome:
     """Leave out photos that are misplaced in the adjusted models, and the pairs that put them there.
 
     Return the same outcome where there are none. Most photos define the model, and stay in it.
     """
+    if not outcome.run.settings.scene.tries("look-alikes"):
+        return outcome
     max_error_px = MAPPING.loose_factor * outcome.run.settings.epipolar.max_error_px
     models, joins = list(outcome.models), list[LookAlikes]()
     for number, (attempt, model) in enumerate(zip(outcome.models, adjusted, strict=True)):

@@ -17,7 +17,7 @@ from sfm_app.mapping.attempt import unregistered_reasons
 from sfm_app.mapping.hypotheses import reconstruct
 from sfm_app.mapping.look_alikes import jumps, look_alike_entries
 from sfm_app.mapping.new_photos import GROWN, map_new_photos
-from sfm_app.mapping.passes import Outcome, without_misplaced
+from sfm_app.mapping.passes import MISPLACED, Outcome, without_misplaced
 from sfm_app.mapping.rolling_shutter import follow_shutter
 from sfm_app.mapping.splits import weakly_joined_parts
 from sfm_app.numerical import Json
@@ -83,7 +83,8 @@ def _finish_scene(outcome: Outcome, run: RunContext) -> Scene:
     names = {image.name: outcome.evidence.camera_name(photo) for photo, image in matches.images.items()}
     adjusted, shutter = _adjust_models(outcome, names, run)
     placed = without_misplaced(outcome, [one.model for one in adjusted])
-    if placed is not outcome and run.settings.scene.tries("look-alikes"):
+    main, kept = (set(posed_photo_ids(one.models[0].model)) for one in (outcome, placed))
+    if placed is not outcome:
         outcome = placed
         adjusted, shutter = _adjust_models(outcome, names, run)
     models = [one.model for one in adjusted]
@@ -95,6 +96,7 @@ def _finish_scene(outcome: Outcome, run: RunContext) -> Scene:
     write_sparse_models(models, run.workspace)
     members = [posed_photo_ids(model) for model in models]
     reasons = unregistered_reasons(set(members[0]), members[1:], matches, views, outcome.graph)
+    reasons |= dict.fromkeys(matches.names(sorted(main - kept)), MISPLACED)
     ids = {names[image.name]: image.camera_id for image in posed_images(adjusted[0].model)}
     refined = {name: adjusted[0].refined[key] for name, key in ids.items()}
     scene = read_scene(run.workspace.sparse, names, reasons, refined)
