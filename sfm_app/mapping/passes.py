@@ -194,7 +194,8 @@ def without_misplaced(outcome: Outcome, adjusted: Sequence[Reconstruction]) -> O
         misplaced = find_misplaced(model, outcome.evidence, max_error_px)
         if not 0 < len(misplaced) < attempt.photos / 2:
             continue
-        models[number] = part_of(attempt, set(posed_photo_ids(attempt.model)) - misplaced.keys())
+        with translate_errors("leaving out photos"):
+            models[number] = part_of(attempt, set(posed_photo_ids(attempt.model)) - misplaced.keys())
         for photo, missing in misplaced.items():
             pairs = {
                 pair for pair, one in attempt.explained.items() if photo in pair and one.matches > one.contradicted

@@ -77,27 +77,26 @@ def divide_photos(
     others = (FocalGrid(tables, rows, theta, members) for theta in starts)
     shared = max(chain([usual], others), key=lambda grid: grid.fit(few))
     fold = np.random.default_rng(seed).permutation(len(rows)) % DIVISION.folds
-    two = few if known or mixed else shared.two_cameras()
+    two, own = few if known else shared.two_cameras(), np.arange(len(everyone))
     hypotheses = (
-        (two, log_probability(two) - log_probability(few)),
-        (np.arange(len(everyone)), 0.0 if mixed else -float(np.log(CONSENSUS.rarity))),
+        (two, log_probability(two) - log_probability(few), DIVISION.max_remaining_share),
+        (own, 0.0, 1.0) if mixed else (own, -float(np.log(CONSENSUS.rarity)), DIVISION.max_remaining_share),
     )
-    max_remaining_share = 1.0 if mixed else DIVISION.max_remaining_share
-    labels, is_doubtful = _choose(few, hypotheses, {shared, usual}, fold, max_remaining_share)
+    labels, is_doubtful = _choose(few, hypotheses, {shared, usual}, fold)
     return Division(dict(zip(everyone, labels.tolist(), strict=True)), shared.cameras(labels), is_doubtful)
 
 
 def _choose(
-    labels: IndexArray, hypotheses: Iterable[tuple[IndexArray, float]], grids: "set[FocalGrid]", fold: IndexArray,
-    max_remaining_share: float,
-) -> tuple[IndexArray, bool]:  # fmt: skip
-    """Return the most probable cameras (N,), and whether more are possible; a hypothesis has its log-prior odds.
+    labels: IndexArray, hypotheses: Iterable[tuple[IndexArray, float, float]], grids: "set[FocalGrid]", fold: IndexArray
+) -> tuple[IndexArray, bool]:
+    """Return the most probable cameras (N,), and whether more are possible.
 
-    A focal of its own also absorbs errors that the pairs of a photo share: more cameras must explain most of the rest.
+    A hypothesis has its log-prior odds, and the share of the unexplained likelihood that it may leave. A focal of
+    its own also absorbs errors that the pairs of a photo share: more cameras must explain most of the rest.
     """
     is_doubtful, doubt = False, float(np.log(1.0 - CONSENSUS.sure))
     most = next(iter(grids)).most
-    for more, log_prior in hypotheses:
+    for more, log_prior, max_remaining_share in hypotheses:
         before, after = (max(grid.fit(one) for grid in grids) for one in (labels, more))
         # a gain that is missing on the fitted pairs will not appear on those held out
         if after - before + log_prior <= doubt or np.array_equal(more, labels):

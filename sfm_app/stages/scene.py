@@ -86,6 +86,7 @@ def _finish_scene(outcome: Outcome, run: RunContext) -> Scene:
     main, kept = (set(posed_photo_ids(one.models[0].model)) for one in (outcome, placed))
     if placed is not outcome:
         outcome = placed
+        run.progress.say("some photos contradict their places; adjusting again without them")
         adjusted, shutter = _adjust_models(outcome, names, run)
     models = [one.model for one in adjusted]
     with translate_errors("reading colors"):

@@ -229,7 +229,7 @@ def test_a_photo_that_lacks_what_it_should_show_is_left_out_if_its_matches_contr
     near = wall[np.abs(walls.points[wall, 0] - 6.0) < 2.5]
     walls.add_walk([21], [6.0], np.concatenate([near[:common], other]))
     model, explained = walls.finish()
-    photos = {key: [end.point3D_id for end in model.images[key].points2D] for key in (6, 21)}
+    photos = {key: [end.point3D_id for end in model.images[key].points2D] for key in model.images}
     agreeing = [(photos[6].index(key), row) for row, key in enumerate(photos[21]) if key in photos[6]]
     rows = np.array([*agreeing, *((k, len(photos[21]) - 1 - k) for k in range(wrong))], np.uint32)
     matches = MatchGraph(

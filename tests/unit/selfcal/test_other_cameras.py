@@ -88,6 +88,13 @@ def test_in_a_mixed_folder_photos_with_many_wrong_pairs_are_divided_if_focals_di
 
 
 @slow
+def test_two_cameras_of_a_mixed_folder_stay_two(shots):
+    for seed in range(4):
+        made = shots(8, seed, focal=[1000.0] * 4 + [1500.0] * 4, points=120)
+        assert labels_of(divide(made, mixed=True)) == [0] * 4 + [1] * 4
+
+
+@slow
 @pytest.mark.parametrize("motion", ["orbit", "parallel", "onward", "turning"])
 def test_motions_that_leave_the_focal_open_do_not_divide_photos(shots, motion):
     for seed in range(4):

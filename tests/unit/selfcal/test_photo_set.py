@@ -250,6 +250,19 @@ def test_a_folder_of_unlike_cameras_gets_one_for_each_photo(shots):
     assert max(map(abs, known)) < 0.1
 
 
+def test_a_size_with_wrong_pairs_is_divided_where_the_other_sizes_are(shots):
+    made, rng = shots(18, 4, focal=[*UNLIKE[::2], 1100.0] * 3, points=120), np.random.default_rng(0)
+    pairs = made.as_set(["a"] * 6 + ["b"] * 6 + ["c"] * 6)
+    Fs = np.array(pairs.Fs)
+    wrong = [k for k, pair in enumerate(pairs.photos) if min(pair) >= 12 and rng.random() < 0.7]
+    K = np.array([[1e3, 0, 500], [0, 1e3, 375], [0, 0, 1]])
+    for k in wrong:
+        change = K @ np.diag([1.0, 1.0, np.exp(rng.uniform(-1, 1))]) @ np.linalg.inv(K)
+        Fs[k] = change.T @ Fs[k] @ change
+    mixed = cameras_of(replace(pairs, Fs=Fs))
+    assert sorted(len(one.photos) for one in mixed) == [1] * 18
+
+
 def test_a_photo_without_pairs_follows_the_others(shots):
     focals = 2.0 * UNLIKE
     made = shots(10, 322, focal=focals, noise_px=0.5, points=300)

@@ -16,6 +16,7 @@ from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import posed_photo_ids, submodel
 from sfm_app.errors import ReconstructionError
+from sfm_app.mapping import passes
 from sfm_app.mapping.attempt import Attempt, PairSupport
 from sfm_app.mapping.passes import Outcome, Trial
 from sfm_app.plugins import load_plugins
@@ -134,6 +135,24 @@ def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthe
     again = read_scene(run.workspace)
     assert again.unregistered == found.unregistered and again.points == found.points
     assert all(np.array_equal(again.cam_from_world[key], value) for key, value in found.cam_from_world.items())
+
+
+def test_a_photo_that_contradicts_its_place_is_left_out_with_the_reason(synthetic, run, mapped, monkeypatch):
+    true = synthetic[1]
+    graph = PoseGraph({(1, 8): pose("calibrated")}, {}, ())
+    made = outcome(attempt(true, {(1, 8): PairSupport(20, 20, 0)}), graph=graph)
+    mapped(made)
+    monkeypatch.setattr(passes, "find_misplaced", lambda *_: {8: 0.9})
+    matches, views = inputs(true)
+    matches = replace(matches, matches={(1, 8): np.zeros((20, 2), np.uint32)})
+
+    found = scene.make(matches, views, made.calibrated, run)
+
+    left_out = matches.images[8].name
+    assert found.unregistered == {left_out: passes.MISPLACED} and len(found.registered) == 7
+    assert run.statistics["look_alikes"] == [
+        {"pairs": 1, "between": [[matches.images[1].name], [left_out]], "missing": 0.9}
+    ]
 
 
 def test_cameras_that_mapping_divided_are_read_back(synthetic, run, mapped):
