@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from itertools import combinations
+from itertools import combinations, permutations
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,8 @@ Pose = NDArray[np.float64]
 
 LOST_DEG = 180.0
 """Error of a pair with a photo that has no pose, and of a pair without F."""
+MISPLACED_DEG, MISPLACED_SHARE = 20.0, 0.1
+"""Errors of a photo beyond which it is in a wrong place; the second in sizes of the scene."""
 CAP_PX = 5.0
 """A fundamental matrix with a larger error has failed; capped errors count it at this value."""
 
@@ -107,6 +109,27 @@ def position_rms_percent(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -
     ours, true = (np.array([_position(poses[name]) for name in common]) for poses in (found, truth))
     distances = np.linalg.norm(umeyama(ours, true)(ours) - true, axis=1)
     return float(100 * np.sqrt(np.mean(distances**2)) / np.linalg.norm(true - true.mean(0), axis=1).mean())
+
+
+def misplaced_photos(found: Mapping[str, Pose], truth: Mapping[str, Pose], scene_size: float) -> list[str]:
+    """Return the photos in a wrong place after the similarity of two photos that leaves the smallest errors.
+
+    An error counts up to the limit, so that a few wrong photos do not move the others.
+    """
+    common = sorted(set(found) & set(truth))
+    ours, true = (np.array([_position(poses[name]) for name in common]) for poses in (found, truth))
+    R_ours, R_true = (np.array([poses[name][:, :3] for name in common]) for poses in (found, truth))
+    smallest, errors = np.inf, np.zeros(len(common))
+    for a, b in permutations(range(len(common)), 2):
+        scale = np.linalg.norm(true[a] - true[b]) / max(float(np.linalg.norm(ours[a] - ours[b])), 1e-12)
+        turn = R_true[a].T @ R_ours[a]
+        shifts = np.linalg.norm(scale * (ours - ours[a]) @ turn.T + true[a] - true, axis=1)
+        cosines = (np.einsum("nij,nij->n", R_true @ turn, R_ours) - 1) / 2
+        angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+        here = np.maximum(shifts / (MISPLACED_SHARE * scene_size), angles / MISPLACED_DEG)
+        if (cost := np.minimum(here, 1.0).sum()) < smallest:
+            smallest, errors = cost, here
+    return [name for name, error in zip(common, errors, strict=True) if error > 1.0]
 
 
 def _position(pose: Pose) -> NDArray[np.float64]:

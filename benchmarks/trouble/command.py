@@ -13,20 +13,20 @@ import argparse
 import json
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from threading import Lock
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from benchmarks.cameras.methods import Method, ablations
-from benchmarks.cameras.score import TruePhoto, accuracy, read_models
+from benchmarks.cameras.score import Model, TruePhoto, accuracy, read_models
 from benchmarks.cameras.worker import OURS
 from benchmarks.common.command_line import new_parser
-from benchmarks.common.metrics import focal_error_percent
+from benchmarks.common.metrics import focal_error_percent, misplaced_photos
 from benchmarks.common.outputs import read_initial_cameras, read_refined_cameras
 from benchmarks.common.photo_sets import PhotoSet
 from benchmarks.common.processes import run_command
@@ -36,6 +36,7 @@ from benchmarks.corpus.report import GAINS_TEXT, hypothesis_rows
 from benchmarks.corpus.score import Doubt, parameter_errors
 from benchmarks.synthetic.hard import HARD
 from benchmarks.synthetic.trouble import KINDS, troubled_folder, write_troubled_folder
+from sfm_app.report.text import place_warnings
 from sfm_app.settings import HypothesisName
 from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth
 
@@ -46,12 +47,16 @@ ABOUT = (
     "support a scene, and it says why) are expected, all others are failures. known: photos whose K is called "
     "identifiable before mapping; focal %: its error against the camera that took the photo, the worst photo; after: "
     "bundle adjustment, where a focal counts as known when three stated deviations are within 3 %. in sd: fx, fy, cx "
-    "and cy after bundle adjustment in stated deviations, against the median of the cameras of the photos."
+    "and cy after bundle adjustment in stated deviations, against the median of the cameras of the photos. misplaced: "
+    "placed photos over 20 degrees or a tenth of the distance of the scene off; silent: those of them whose camera is "
+    "called identifiable, in runs without a warning about places."
 )
 WRONG_PERCENT = 5.0
 """A focal that is called identifiable and has a larger error is wrong."""
 WRONG_SHARE = 0.01
 """Largest share of folders that may have a wrong focal."""
+SILENT_SHARE = 0.003
+"""Largest share of placed photos that may be in a wrong place without a warning."""
 EXPECTED = (0, 4)
 RENDER_LOCK = Lock()
 """Held while rendering, which uses all cores anyway."""
@@ -118,9 +123,11 @@ def summary_line(row: Row) -> str:
 
 def score_run(out: Path, truth: Truth) -> Row:
     """Score the result against the truth."""
+    laid = laid_photos(out)
     photos = {
-        Path(name).stem: TruePhoto(camera.K, truth.cam_from_world[name], camera.width)
+        Path(name).stem: lay(photo) if name in laid else photo
         for name, camera in truth.cameras.items()
+        for photo in (TruePhoto(camera.K, truth.cam_from_world[name], camera.width),)
     }
     models = read_models(out) if out.exists() else []
     found = accuracy(models, photos, len(photos))
@@ -136,6 +143,7 @@ def score_run(out: Path, truth: Truth) -> Row:
         "models": found["models"],
         "AUC@1": found["AUC@1"],
         "AUC@5": found["AUC@5"],
+        **misplaced(out, models, photos, truth),
         **known_cameras(out, photos, "before"),
         **known_cameras(out, photos, "after", [row for row in stated if row["when"] == "after"]),
         "stated": len(after),
@@ -144,13 +152,46 @@ def score_run(out: Path, truth: Truth) -> Row:
     }
 
 
+def laid_photos(out: Path) -> set[str]:
+    """Return the photos that the program laid on their side, because most others are wide."""
+    file = out / "photos.json"
+    entries = json.loads(file.read_text(encoding="utf-8"))["photos"] if file.exists() else ()
+    return {entry["name"] for entry in entries if entry["turn_deg"] == 90}
+
+
+def lay(photo: TruePhoto) -> TruePhoto:
+    """Return the camera of an upright photo after a quarter turn to the left."""
+    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    moved = np.array([turn[0], [-1.0, 0.0, photo.width], turn[2]])
+    return photo._replace(K=moved @ photo.K @ turn.T, pose=turn @ photo.pose)
+
+
+def misplaced(out: Path, models: Sequence[Model], photos: Mapping[str, TruePhoto], truth: Truth) -> Row:
+    """Count the photos of the main model in a wrong place, and those of them without any warning."""
+    if not models:
+        return {"misplaced": 0, "silent": 0}
+    poses = {name: photo.pose for name, photo in photos.items()}
+    middle = np.median(truth.vertices, axis=0)
+    size = float(np.median([np.linalg.norm(center - middle) for center in truth.centers.values()]))
+    wrong = misplaced_photos(models[0].poses, poses, size)
+    cameras, camera_of = read_initial_cameras(out)
+    known = {Path(photo).stem for photo, name in camera_of.items() if cameras[name]["identifiable"]}
+    warned = any(place_warnings(manifest(out).get("scene", {}).get("counts", {})))
+    return {"misplaced": len(wrong), "silent": 0 if warned else len(known & set(wrong))}
+
+
+def manifest(out: Path) -> dict[str, Any]:
+    """Return the records of the stages in OUT; empty without them."""
+    try:
+        stages: dict[str, Any] = json.loads((out / "manifest.json").read_text(encoding="utf-8"))["stages"]
+    except (OSError, ValueError, KeyError):
+        return {}
+    return stages
+
+
 def cpu_seconds(out: Path, stage: str) -> float | None:
     """Return the CPU seconds of a stage in OUT; None without them."""
-    try:
-        stages = json.loads((out / "manifest.json").read_text(encoding="utf-8"))["stages"]
-    except (OSError, ValueError, KeyError):
-        return None
-    seconds: float | None = stages.get(stage, {}).get("cpu_seconds")
+    seconds: float | None = manifest(out).get(stage, {}).get("cpu_seconds")
     return seconds
 
 
@@ -187,6 +228,8 @@ def summary(rows: Sequence[Row]) -> Row:
         "K known": len(known),
         "K wrong": sum(row["wrong"] for row in rows),
         "K wrong after": sum(row["wrong after"] for row in rows),
+        "misplaced": sum(row["misplaced"] for row in rows),
+        "silent": sum(row["silent"] for row in rows),
         "beyond 3 sd": f"{sum(row['beyond 3 sd'] for row in rows)} of {stated}",
     }
 
@@ -204,12 +247,15 @@ def demands(rows: Sequence[Row]) -> list[Row]:
     all_of = summary(rows)
     before, after, allowed = all_of["K wrong"], all_of["K wrong after"], int(WRONG_SHARE * len(rows))
     stated, off = sum(row["stated"] for row in rows), sum(row["beyond 3 sd"] for row in rows)
-    seeds = {name: [str(row["seed"]) for row in rows if row[name]] for name in ("wrong", "wrong after")}
+    seeds = {name: [str(row["seed"]) for row in rows if row[name]] for name in ("wrong", "wrong after", "silent")}
+    silent, placed = all_of["silent"], sum(row["registered"] for row in rows)
     failed = [str(row["seed"]) for row in rows if row["exit code"] not in EXPECTED]
     found = [
         ("no exception: exit code 0 or 4", all_of["failures"], failed, all_of["failures"] == 0),
         ("K identifiable and over 5 % off: at most 1 %", before, seeds["wrong"], before <= allowed),
         ("the same after bundle adjustment", after, seeds["wrong after"], after <= allowed),
+        ("misplaced without a warning: at most 0.3 % of placed photos", f"{silent} of {placed}", seeds["silent"],
+            silent <= SILENT_SHARE * placed),
         ("at most one parameter of twenty beyond 3 sd", f"{off} of {stated}", [], 20 * off <= stated),
     ]  # fmt: skip
     return [
@@ -221,9 +267,12 @@ def demands(rows: Sequence[Row]) -> list[Row]:
 def page(rows: Sequence[Row]) -> str:
     """Return the tables: requirements, results by trouble, the folders that are far off, and gains of hypotheses."""
     gains, rows = hypothesis_rows(rows), [row for row in rows if row["method"] == OURS]
-    far = [row for row in rows if row["exit code"] not in EXPECTED or row["wrong"] or row["wrong after"]]
+    far = [
+        row for row in rows if row["exit code"] not in EXPECTED or row["wrong"] or row["wrong after"] or row["silent"]
+    ]
     shown = (
-        "seed", "troubles", "exit code", "last", "placed", "AUC@5", "known", "focal %", "known after", "focal % after",
+        "seed", "troubles", "exit code", "last", "placed", "AUC@5", "misplaced", "silent", "known", "focal %",
+        "known after", "focal % after",
         "worst in sd",
     )  # fmt: skip
     parts = [
@@ -236,7 +285,10 @@ def page(rows: Sequence[Row]) -> str:
         columns = ("seed", "placed", "AUC@5", "features", "cameras", "map + BA", "focal % after", "worst in sd")
         parts += ["## Hard folders; CPU seconds of features and pairs, cameras, map and bundle adjustment\n"]
         parts += [table(rows, columns)]
-    parts += ["## Folders that failed, or whose camera is known and wrong\n", table(far, shown) if far else "None.\n"]
+    parts += [
+        "## Folders that failed, or with a wrong camera or place without a warning\n",
+        table(far, shown) if far else "None.\n",
+    ]
     parts += ["## What each hypothesis gains\n", GAINS_TEXT, table(gains)] if gains else []
     return "\n".join(parts)
 

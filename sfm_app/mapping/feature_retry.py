@@ -1,7 +1,7 @@
 """Finer features for unregistered photos and their likely neighbors.
 
-On plain objects and over wide baselines the usual features are few. Affine shape, domain-size pooling, a lower contrast
-threshold and a looser ratio test give more there. For all photos they would cost too much.
+On plain objects and over wide baselines the usual features are few. Affine shape, a lower contrast threshold and a
+looser ratio test give more there. For all photos they would cost too much.
 """
 
 from collections import Counter

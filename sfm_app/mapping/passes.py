@@ -177,7 +177,10 @@ def _outcome_of(groups: Sequence[MappedGroup], start: Outcome) -> Outcome:
     )
 
 
-MISPLACED = "at the place of its matches, most expected points are missing; perhaps it shows an equal side elsewhere"
+MISPLACED = (
+    "where its matches place it, most of the expected points are missing; perhaps it shows another, equal side: take "
+    "photos between the two sides"
+)
 """Why a photo was left out."""
 
 

@@ -248,15 +248,15 @@ def _remark_lines(counts: Mapping[str, Any]) -> Iterator[str]:
         yield from _mapping_lines(counts)
     for photos in counts.get("cut_apart", ()):
         yield f"split, because more matches contradict the connection than support it: {photos}"
-    yield from _doubt_lines(counts)
+    for join in counts.get("look_alikes", ()):
+        here, there = (list_names(names, NAMES_SHOWN) for names in join["between"])
+        yield (
+            f"look-alikes separated, {join['pairs']} pairs of photos: {here} | {there} "
+            f"({100 * join['missing']:.0f} % of the expected overlap is missing)"
+        )
+    yield from place_warnings(counts)
     for number, names in enumerate(counts.get("other_models", ()), start=1):
         yield f"another model of {len(names)} photos in other_models/{number}: {list_names(names, NAMES_SHOWN)}"
-    explained, against = counts.get("explained_matches", 0), counts.get("contradicted_matches", 0)
-    if against > 0.1 * (explained + against):
-        yield (
-            f"beware: {100 * against / (explained + against):.0f} % of the matches between these photos contradict "
-            "the model; look for places that look alike"
-        )
     yield from _shutter_lines(counts.get("shutter", {}))
     yield from _adjustment_warnings(counts.get("adjustment", {}))
     yield from _orientation_lines(counts.get("orientation", {}))
@@ -297,13 +297,8 @@ def _adjustment_warnings(adjustment: Mapping[str, Any]) -> Iterator[str]:
         yield f"beware: these photos do not determine camera {name}; it keeps its values from mapping"
 
 
-def _doubt_lines(counts: Mapping[str, Any]) -> Iterator[str]:
-    for join in counts.get("look_alikes", ()):
-        here, there = (list_names(names, NAMES_SHOWN) for names in join["between"])
-        yield (
-            f"look-alikes separated, {join['pairs']} pairs of photos: {here} | {there} "
-            f"({100 * join['missing']:.0f} % of the expected overlap is missing)"
-        )
+def place_warnings(counts: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the warnings that photos may be in wrong places; `counts` are figures of the stage `scene`."""
     for join in counts.get("perhaps_look_alikes", ()):
         here, there = (list_names(names, NAMES_SHOWN) for names in join["between"])
         yield f"beware: a loop, or look-alikes: {join['pairs']} pairs match {here} with {there}, without photos between"
@@ -312,6 +307,14 @@ def _doubt_lines(counts: Mapping[str, Any]) -> Iterator[str]:
         yield f"beware: few points determine the distance of {text} from the rest; take more photos between them"
     for before, after in counts.get("jumps", ()):
         yield f"beware: a jump between the consecutive photos {before} and {after}; in a video, a sign of look-alikes"
+    if any(trial["name"] == "false-joins" and trial["accepted"] for trial in counts.get("hypotheses", ())):
+        yield "beware: some sides of this place look alike; compare photos with the model, one may be on a wrong side"
+    explained, against = counts.get("explained_matches", 0), counts.get("contradicted_matches", 0)
+    if against > 0.1 * (explained + against):
+        yield (
+            f"beware: {100 * against / (explained + against):.0f} % of the matches between these photos contradict "
+            "the model; look for places that look alike"
+        )
 
 
 def _orientation_lines(orientation: Mapping[str, Any]) -> Iterator[str]:

@@ -12,6 +12,7 @@ from benchmarks.common.metrics import (
     area_under_recall,
     fundamental_pose_error_deg,
     mean_sampson_px,
+    misplaced_photos,
     pose_errors_deg,
     position_rms_percent,
     summary_px,
@@ -64,6 +65,20 @@ def test_rms_is_counted_in_mean_distances_from_the_mean():
     lifted = {name: pose((x, y, up[name])) for name, (x, y, _) in CORNERS.items()}
     assert position_rms_percent(lifted, POSES) == pytest.approx(100 * np.sqrt(0.01 / 4.01))
     assert position_rms_percent({name: POSES[name] for name in "ab"}, POSES) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "is_wrong"),
+    [
+        (pose((2, 0, 0), 19.0), False),
+        (pose((2, 0, 0), 21.0), True),
+        (pose((2, 0, 0.3)), False),
+        (pose((2, 0, 0.5)), True),
+    ],
+)
+def test_a_photo_far_off_is_misplaced_and_does_not_drag_others_along(change, is_wrong):
+    found = moved({**POSES, "a": change}, 0.3, TURN, np.array([4.0, -7.0, 1.0]))
+    assert misplaced_photos(found, POSES, 4.0) == ["a"] * is_wrong
 
 
 def test_a_photo_left_out_costs_all_its_pairs():

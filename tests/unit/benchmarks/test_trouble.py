@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.cameras.score import TruePhoto
+from benchmarks.cameras.score import Model, TruePhoto
 from benchmarks.trouble import command as trouble
 from sfm_app.camera.models import camera_matrix
 
@@ -48,10 +48,20 @@ def test_what_is_called_a_guess_is_not_wrong(tmp_path):
     assert trouble.score_run(tmp_path / "nothing", truth)["known"] == "0/2"
 
 
+def test_a_photo_that_the_program_lays_on_its_side_is_held_against_its_turned_camera():
+    photo = TruePhoto(camera_matrix(600.0, 700.0, 310.0, 250.0), np.eye(3, 4), 480.0)
+    x, y, _ = photo.K @ [0.3, 0.1, 1.0]
+    laid = trouble.lay(photo)
+    u, v, w = laid.K @ laid.pose @ [0.3, 0.1, 1.0, 1.0]
+    assert np.allclose([u, v, w], [y, 480.0 - x, 1.0])  # the upper right corner comes to the upper left
+    assert np.allclose(laid.K, camera_matrix(700.0, 600.0, 250.0, 170.0))
+
+
 def folder_row(seed=1, troubles="plane, zoom", **figures):
     fine = {
         "method": "sfm-app", "photos": f"{seed:05d}", "seed": seed,
         "troubles": troubles, "exit code": 0, "last": "", "placed": "6/6", "share placed": 1.0,
+        "registered": 6, "misplaced": 0, "silent": 0,
         "AUC@5": 0.8, "known": "6/6", "focal %": 0.5, "wrong": 0, "known after": "6/6", "focal % after": 0.4,
         "wrong after": 0, "stated": 4, "beyond 3 sd": 0, "worst in sd": 1.0,
     }  # fmt: skip
@@ -65,8 +75,8 @@ def met(rows):
 def test_one_wrong_camera_in_a_hundred_folders_passes_and_two_do_not():
     fine = [folder_row(seed) for seed in range(98)]
     one, two = folder_row(98, wrong=1), folder_row(99, wrong=1, **{"wrong after": 1})
-    assert met([*fine, one, folder_row(99)]) == ["yes"] * 4
-    assert met([*fine, one, two]) == ["yes", "no", "yes", "yes"]
+    assert met([*fine, one, folder_row(99)]) == ["yes"] * 5
+    assert met([*fine, one, two]) == ["yes", "no", "yes", "yes", "yes"]
     assert trouble.demands([*fine, one, two])[1]["seeds"] == "98, 99"
 
 
@@ -75,6 +85,29 @@ def test_only_a_scene_or_a_reason_why_there_is_none_is_expected(code, fails):
     rows = [folder_row(**{"exit code": code, "last": "error: unexpected ValueError: x"})]
     assert (met(rows)[0] == "no") is fails
     assert ("unexpected ValueError" in trouble.page(rows)) is fails
+
+
+def test_photos_in_wrong_places_fail_only_without_a_warning(tmp_path):
+    poses = {name: np.column_stack([np.eye(3), [-3.0 * k, 0.0, 4.0]]) for k, name in enumerate("abc")}
+    photos = {name: TruePhoto(K, pose, 640.0) for name, pose in poses.items()}
+    truth = SimpleNamespace(centers={name: -pose[:, 3] for name, pose in poses.items()}, vertices=np.zeros((1, 3)))
+    shifted = {**poses, "b": poses["b"] + [[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0]]}
+    models = [Model(shifted, {}, 5, 9, 0.3)]
+    left_behind(tmp_path, identifiable=True, sd=1.0)
+    counts = {"scene": {"counts": {"explained_matches": 95, "contradicted_matches": 5}}}
+    (tmp_path / "manifest.json").write_text(json.dumps({"stages": counts}))
+    silent = trouble.misplaced(tmp_path, models, photos, truth)
+    assert silent == {"misplaced": 1, "silent": 1}
+    counts["scene"]["counts"]["contradicted_matches"] = 50
+    (tmp_path / "manifest.json").write_text(json.dumps({"stages": counts}))
+    warned = trouble.misplaced(tmp_path, models, photos, truth)
+    assert warned == {"misplaced": 1, "silent": 0}
+    left_behind(tmp_path, identifiable=False, sd=1.0)
+    (tmp_path / "manifest.json").unlink()
+    assert trouble.misplaced(tmp_path, models, photos, truth) == warned
+    rows = [folder_row(seed) for seed in range(99)]
+    assert met([*rows, folder_row(99, **silent)]) == ["yes"] * 5
+    assert met([*rows, folder_row(99, misplaced=2, silent=2)])[3] == "no"
 
 
 def test_the_absence_of_a_hypothesis_is_counted_in_the_folders_where_it_was_tried():

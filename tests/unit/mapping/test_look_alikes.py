@@ -298,6 +298,35 @@ def test_one_street_that_is_walked_twice_is_no_false_join(walls):
 
 
 @pytest.mark.slow
+def test_two_sides_with_equal_facades_and_other_gardens_are_told_apart(walls):
+    facade = walls.add_points(0, 12, seed=0)
+    facade = facade[walls.points[facade, 1] < 1]
+    for first, seed in ((1, 1), (101, 2)):
+        garden = walls.add_points(0, 12, seed)
+        garden = garden[walls.points[garden, 1] > 1]
+        walls.add_walk(range(first, first + 12), np.linspace(3, 9, 12), np.concatenate([facade, garden]))
+    model, explained = walls.finish()
+    (join,), across = judge_places([Attempt("incremental", model, explained, "")])
+    assert set(join.pairs) == {(a, b) for a, b in explained if a < 100 < b}
+    assert 0.15 < join.missing < 0.35
+    assert across >= 60
+
+
+@pytest.mark.slow
+def test_a_loop_where_each_photo_lacks_other_points_stays(walls):
+    both, later, places = walls.add_points(0, 12, seed=1), walls.add_points(0, 12, seed=2), np.linspace(3, 9, 12)
+    walls.add_walk(range(1, 13), places, both)
+    patches = (2 * walls.points[both, :2]).astype(int) @ [1, 100]
+    for number, place in enumerate(places):
+        lacking = np.random.default_rng(number).permutation(np.unique(patches))[::3]
+        walls.add_walk([101 + number], [place], np.concatenate([both[~np.isin(patches, lacking)], later]))
+    model, explained = walls.finish()
+    shares = [one.shared / one.expected for (a, b), one in find_expected_overlaps(model).items() if a < 100 < b]
+    assert 0.8 < np.median(shares) < 0.9
+    assert judge_places([Attempt("incremental", model, explained, "")]) == ([], 0)
+
+
+@pytest.mark.slow
 def test_a_loop_whose_ends_were_hardly_matched_stays():
     """A quarter of the photos that should share much share nothing: matching failed, the rest bears the loop out."""
     explained = {(a, 100 + b): PairSupport(200, 200, 0) for a in range(12) for b in range(12) if (a + b) % 4}
