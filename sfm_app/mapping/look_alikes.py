@@ -150,7 +150,7 @@ class OVERLAPS:
     """Of the shares of pairs, those within one of several equal sides. Chosen by hand."""
     side_margin: float = 0.1
     """Photos are on one side from this share less this. Chosen by hand."""
-    min_judged: int = 8
+    min_judged: int = 10
     """Photos with enough neighbors across that prove two sides. Chosen by hand."""
     missing_ratio: float = 4.2
     """Missing cells across equal sides, in those within. Measured: folded models of books21, oats23 and a palace have
