@@ -308,7 +308,7 @@ def place_warnings(counts: Mapping[str, Any]) -> Iterator[str]:
     for before, after in counts.get("jumps", ()):
         yield f"beware: a jump between the consecutive photos {before} and {after}; in a video, a sign of look-alikes"
     if any(trial["name"] == "false-joins" and trial["accepted"] for trial in counts.get("hypotheses", ())):
-        yield "beware: some sides of this place look alike; compare photos with the model, one may be on a wrong side"
+        yield "beware: some sides of this place look alike; photos may be on a wrong one: take more around its corners"
     explained, against = counts.get("explained_matches", 0), counts.get("contradicted_matches", 0)
     if against > 0.1 * (explained + against):
         yield (
