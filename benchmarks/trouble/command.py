@@ -36,7 +36,9 @@ from benchmarks.corpus.report import GAINS_TEXT, hypothesis_rows
 from benchmarks.corpus.score import Doubt, parameter_errors
 from benchmarks.synthetic.hard import HARD
 from benchmarks.synthetic.trouble import KINDS, troubled_folder, write_troubled_folder
+from sfm_app.products import read_scene
 from sfm_app.report.text import place_warnings
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import HypothesisName
 from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth
 
@@ -48,8 +50,8 @@ ABOUT = (
     "identifiable before mapping; focal %: its error against the camera that took the photo, the worst photo; after: "
     "bundle adjustment, where a focal counts as known when three stated deviations are within 3 %. in sd: fx, fy, cx "
     "and cy after bundle adjustment in stated deviations, against the median of the cameras of the photos. misplaced: "
-    "placed photos over 20 degrees or a tenth of the distance of the scene off; silent: those of them whose camera is "
-    "called identifiable, in runs without a warning about places."
+    "placed photos over 20 degrees or a tenth of the distance of the scene off; silent: those in runs without a "
+    "warning about places or focal lengths."
 )
 WRONG_PERCENT = 5.0
 """A focal that is called identifiable and has a larger error is wrong."""
@@ -174,10 +176,8 @@ def misplaced(out: Path, models: Sequence[Model], photos: Mapping[str, TruePhoto
     middle = np.median(truth.vertices, axis=0)
     size = float(np.median([np.linalg.norm(center - middle) for center in truth.centers.values()]))
     wrong = misplaced_photos(models[0].poses, poses, size)
-    cameras, camera_of = read_initial_cameras(out)
-    known = {Path(photo).stem for photo, name in camera_of.items() if cameras[name]["identifiable"]}
-    warned = any(place_warnings(manifest(out).get("scene", {}).get("counts", {})))
-    return {"misplaced": len(wrong), "silent": 0 if warned else len(known & set(wrong))}
+    warned = any(place_warnings(read_scene(Workspace(out)), manifest(out)["scene"]["counts"]))
+    return {"misplaced": len(wrong), "silent": 0 if warned else len(wrong)}
 
 
 def manifest(out: Path) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from sfm_app.camera.models import calibration_from_model
 from sfm_app.cli.output import WIDTH, file_lines
 from sfm_app.report.text import (
     SOURCES,
+    UNSURE_FOCAL,
     WARNING,
     duration_text,
     field_text,
@@ -143,8 +144,9 @@ def _camera_lines(run: Run) -> Iterator[str]:
         label = f"{name}: " if len(cameras) > 1 else ""
         yield f"camera      {label}{'' if camera.projection == EQUIRECTANGULAR else focal}{field_text(camera)}"
         if not calibration.identifiable:
-            source = "all photos together do"  # a reason would seem to concern the refined camera
-            if model is None:
+            if model is not None:  # the reason would seem to concern the refined camera
+                source = "all photos together do" if model.focal_doubt <= UNSURE_FOCAL else "nor do all photos together"
+            else:
                 source = f"this is {SOURCES.get(calibration.method, calibration.method)}: {calibration.reason}"
             yield f"{INDENT}pairs of photos do not determine it; {source}"
     if len(cameras) > LINES_SHOWN:

@@ -14,7 +14,7 @@ from PIL import Image
 from sfm_app.camera.models import PARAMETERS
 from sfm_app.colmap.model import ModelFigures
 from sfm_app.report.contents import RunContents, data_address
-from sfm_app.report.text import SOURCES, WARNING, duration_text, intrinsics_lines, result_lines
+from sfm_app.report.text import REMEDY, SOURCES, WARNING, duration_text, intrinsics_lines, result_lines
 from sfm_app.runtime.workspace import model_triangles
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraModel, Photo
@@ -70,11 +70,6 @@ def correlation_text(value: float) -> str:
 
 UNKNOWN_CAMERA = "these photos do not determine it"
 """Prefix of the reason why a camera is a guess."""
-REMEDY = (
-    "add photos from nearer, farther and other heights, some with the camera turned on its side, or give a known "
-    "camera with --calibration FILE"
-)
-"""For a camera that pairs of photos do not determine."""
 PLACES_IN_K = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 
 

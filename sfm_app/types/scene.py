@@ -28,6 +28,11 @@ class CameraModel:
     correlations: Mapping[str, float] = field(default_factory=dict)
     """Correlations of the parameters in `deviations`, from -1 to 1, by two names with a space between: "fx k1"."""
 
+    @property
+    def focal_doubt(self) -> float:
+        """Standard deviation of the focal length as a share of it; 0 if none is stated."""
+        return max((self.deviations.get(name, 0.0) / self.K[k, k] for k, name in enumerate(("fx", "fy"))), default=0.0)
+
     def to_dict(self) -> dict[str, Any]:
         """Return JSON values."""
         plain = {field.name: getattr(self, field.name) for field in fields(self)}

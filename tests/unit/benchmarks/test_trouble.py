@@ -7,6 +7,7 @@ import pytest
 from benchmarks.cameras.score import Model, TruePhoto
 from benchmarks.trouble import command as trouble
 from sfm_app.camera.models import camera_matrix
+from sfm_app.types import CameraModel, Scene
 
 K = camera_matrix(600.0, 600.0, 320.0, 240.0)
 LONG = camera_matrix(660.0, 660.0, 320.0, 240.0)
@@ -87,26 +88,21 @@ def test_only_a_scene_or_a_reason_why_there_is_none_is_expected(code, fails):
     assert ("unexpected ValueError" in trouble.page(rows)) is fails
 
 
-def test_photos_in_wrong_places_fail_only_without_a_warning(tmp_path):
+def test_photos_in_wrong_places_fail_only_without_a_warning(tmp_path, monkeypatch):
     poses = {name: np.column_stack([np.eye(3), [-3.0 * k, 0.0, 4.0]]) for k, name in enumerate("abc")}
     photos = {name: TruePhoto(K, pose, 640.0) for name, pose in poses.items()}
     truth = SimpleNamespace(centers={name: -pose[:, 3] for name, pose in poses.items()}, vertices=np.zeros((1, 3)))
     shifted = {**poses, "b": poses["b"] + [[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0]]}
     models = [Model(shifted, {}, 5, 9, 0.3)]
-    left_behind(tmp_path, identifiable=True, sd=1.0)
-    counts = {"scene": {"counts": {"explained_matches": 95, "contradicted_matches": 5}}}
-    (tmp_path / "manifest.json").write_text(json.dumps({"stages": counts}))
-    silent = trouble.misplaced(tmp_path, models, photos, truth)
-    assert silent == {"misplaced": 1, "silent": 1}
-    counts["scene"]["counts"]["contradicted_matches"] = 50
-    (tmp_path / "manifest.json").write_text(json.dumps({"stages": counts}))
-    warned = trouble.misplaced(tmp_path, models, photos, truth)
-    assert warned == {"misplaced": 1, "silent": 0}
-    left_behind(tmp_path, identifiable=False, sd=1.0)
-    (tmp_path / "manifest.json").unlink()
-    assert trouble.misplaced(tmp_path, models, photos, truth) == warned
+    camera = CameraModel("OPENCV", (600.0, 600.0, 320.0, 240.0, 0, 0, 0, 0), K, 640, 480, {"fx": 1.0})
+    scene = Scene(tmp_path, {}, {}, {"one": camera}, 5, 9, 0.3, {"b.jpg": "one"})
+    monkeypatch.setattr(trouble, "read_scene", lambda _: scene)
+    for against, silent in ((5, 1), (50, 0)):
+        counts = {"scene": {"counts": {"explained_matches": 95, "contradicted_matches": against}}}
+        (tmp_path / "manifest.json").write_text(json.dumps({"stages": counts}))
+        assert trouble.misplaced(tmp_path, models, photos, truth) == {"misplaced": 1, "silent": silent}
     rows = [folder_row(seed) for seed in range(99)]
-    assert met([*rows, folder_row(99, **silent)]) == ["yes"] * 5
+    assert met([*rows, folder_row(99, misplaced=1, silent=1)]) == ["yes"] * 5
     assert met([*rows, folder_row(99, misplaced=2, silent=2)])[3] == "no"
 
 

@@ -120,9 +120,14 @@ def test_only_the_first_missing_photos_are_named(finished):
     assert any(line.strip() == "and 38 more photos; -v prints them" for line in lines) and len(lines) < 20
 
 
-@pytest.mark.parametrize(("mapped", "text"), [(True, "all photos together do"), (False, "this is a guess: an orbit")])
-def test_a_camera_that_pairs_do_not_determine_is_marked(finished, mapped, text):
-    run = replace(finished, calibration=Intrinsics({"one": GUESS}), scene=finished.scene if mapped else None)
+@pytest.mark.parametrize(
+    ("deviation", "text"),
+    [(20.0, "all photos together do"), (30.0, "nor do all photos together"), (None, "this is a guess: an orbit")],
+)
+def test_a_camera_that_pairs_do_not_determine_is_marked(finished, deviation, text):
+    refined = {"one": replace(REFINED, deviations={"fx": deviation})}
+    scene = None if deviation is None else replace(finished.scene, cameras=refined)
+    run = replace(finished, calibration=Intrinsics({"one": GUESS}), scene=scene)
     [line] = [line.strip() for line in outcome_lines(run, 250.0) if "pairs of photos" in line]
     assert line == f"pairs of photos do not determine it; {text}"
 

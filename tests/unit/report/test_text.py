@@ -1,5 +1,6 @@
 """Results in sentences."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -80,8 +81,10 @@ COUNTS = {
 }
 
 
-def describe(**counts):
-    scene = Scene(Path("sparse"), PLACED, {"x.jpg": "shares no scene"}, {"one": CAMERA}, 1234, 5000, 0.321)
+def describe(*, cameras=(CAMERA,), **counts):
+    named = {str(number): camera for number, camera in enumerate(cameras)}
+    camera_of = {name: str(number % len(cameras)) for number, name in enumerate(PLACED)}
+    scene = Scene(Path("sparse"), PLACED, {"x.jpg": "shares no scene"}, named, 1234, 5000, 0.321, camera_of)
     return "\n".join(scene_lines(scene, COUNTS | counts)), scene_summary(scene, COUNTS | counts)
 
 
@@ -95,7 +98,7 @@ def test_people_read_how_many_photos_are_placed_how_and_how_sure_the_camera_is()
     assert "fx 900.0 +- 1.2" in text and "fy 901.0  cx" in text
     assert "upright by vanishing lines, to about 0.3 degrees\n" in text and "unit of its own" not in text
     assert "beware" not in text and "another model" not in text
-    assert summary["mapper"] == "global" and summary["cameras"]["one"]["K"][0][0] == 900.0
+    assert summary["mapper"] == "global" and summary["cameras"]["0"]["K"][0][0] == 900.0
 
 
 def test_parts_and_their_wrong_joins_are_describe():
@@ -207,6 +210,22 @@ def test_look_alikes_and_possible_look_alikes_are_named():
 
     text, _ = describe(jumps=[["a.jpg", "b.jpg"]])
     assert "beware: a jump between the consecutive photos a.jpg and b.jpg" in text
+
+    for accepted in (True, False):
+        text, _ = describe(hypotheses=[trial("false-joins", "two places", photos=(5, 5), accepted=accepted)])
+        assert ("beware: some sides of this place look alike" in text) is accepted
+
+
+def test_uncertain_focal_lengths_of_most_photos_are_a_warning():
+    unsure = replace(CAMERA, deviations={"fx": 9.0, "fy": 90.1})
+    text, _ = describe(cameras=[unsure, unsure, CAMERA])
+    assert "beware: the focal length is uncertain by 10 %, and the depth of the model with it: add photos" in text
+    for cameras in (
+        [unsure, CAMERA, CAMERA],
+        [replace(unsure, deviations={"fx": 40.0})],
+        [replace(unsure, deviations={})],
+    ):
+        assert "focal length is uncertain" not in describe(cameras=cameras)[0]
 
 
 def test_a_camera_for_each_photo_is_named_where_it_was_tried():
