@@ -1,11 +1,13 @@
 """Calls of COLMAP in its worker processes, see `worker_process`: no module here loads an estimator."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from sfm_app.colmap.backend import check_written, largest_model, pycolmap, run_with_progress
 from sfm_app.colmap.worker_process import ProgressReporter
 
+MAX_FOCAL_RATIO = 10.0
+"""Largest change of a focal, as a factor: the limit of COLMAP's incremental mapper. By definition."""
 JPEG_QUALITY = 98
 UNDISTORTED_PHOTOS = {"COLMAP": "images", "PMVS": "pmvs/visualize"}
 """Folder of the undistorted photos, by layout."""
@@ -16,7 +18,27 @@ def map_globally(scratch: Path, photo_dir: Path, seed: int, names: Sequence[str]
     (scratch / "all").mkdir()
     options = global_options(seed, names)
     models = pycolmap.global_mapping(scratch / "database.db", photo_dir, scratch / "all", options)
+    database = pycolmap.Database.open(scratch / "database.db")
+    before = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    database.close()
+    for model in models.values():
+        remove_runaways(model, before)
     _write_largest(models, scratch / "model")
+
+
+def remove_runaways(model: pycolmap.Reconstruction, before: Mapping[int, pycolmap.Camera]) -> None:
+    """Remove photos whose focal has changed without bounds, which COLMAP's global mapper does not check."""
+    images: Iterable[pycolmap.Image] = list(model.images.values())
+    frames = set[int]()
+    for image in images:
+        now, then = (cameras[image.camera_id] for cameras in (model.cameras, before))
+        ratios = [now.params[k] / then.params[k] for k in now.focal_length_idxs()]
+        if image.has_pose and not all(1.0 / MAX_FOCAL_RATIO < ratio < MAX_FOCAL_RATIO for ratio in ratios):
+            frames.add(image.frame_id)
+    for frame in sorted(frames):
+        model.deregister_frame(frame)
+    if frames:
+        model.tear_down()
 
 
 def global_options(seed: int, names: Sequence[str]) -> pycolmap.GlobalPipelineOptions:

@@ -1,6 +1,7 @@
 """Results in sentences and, for --json, as plain values."""
 
 from collections.abc import Iterator, Mapping
+from statistics import median
 from types import MappingProxyType
 from typing import Any
 
@@ -296,8 +297,6 @@ def _shutter_lines(shutter: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _adjustment_warnings(adjustment: Mapping[str, Any]) -> Iterator[str]:
-    if adjustment.get("failed"):
-        yield f"beware: the last adjustment failed ({adjustment['failed']}); cameras and poses are those of mapping"
     for number, reason in adjustment.get("failed_in_other_models", {}).items():
         yield f"beware: the last adjustment of other_models/{number} failed ({reason})"
     for name in adjustment.get("cameras_held", ()):
@@ -306,10 +305,14 @@ def _adjustment_warnings(adjustment: Mapping[str, Any]) -> Iterator[str]:
 
 def place_warnings(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
     """Yield the warnings that photos may be in wrong places; `counts` are figures of the stage `scene`."""
-    doubts = sorted(scene.cameras[name].focal_doubt for name in scene.camera_of.values())
-    if doubts and (doubt := doubts[len(doubts) // 2]) > UNSURE_FOCAL:
-        uncertain = f"the focal length is uncertain by {100 * doubt:.0f} %, and the depth of the model with it"
-        yield f"beware: {uncertain}: {REMEDY}"
+    doubts = {photo: scene.cameras[name].focal_doubt for photo, name in scene.camera_of.items()}
+    unsure = [photo for photo, doubt in doubts.items() if doubt > UNSURE_FOCAL]
+    if unsure:
+        percent = 100 * median(doubts[photo] for photo in unsure)
+        of = f" of {list_names(unsure, NAMES_SHOWN)}" if 2 * len(unsure) <= len(doubts) else ""
+        yield f"beware: the focal length{of} is uncertain by {percent:.0f} %, and depths with it: {REMEDY}"
+    if failure := counts.get("adjustment", {}).get("failed"):
+        yield f"beware: the last adjustment failed ({failure}), so places and depths are those of mapping: {REMEDY}"
     for join in counts.get("perhaps_look_alikes", ()):
         here, there = (list_names(names, NAMES_SHOWN) for names in join["between"])
         yield f"beware: a loop, or look-alikes: {join['pairs']} pairs match {here} with {there}, without photos between"

@@ -8,7 +8,7 @@ import pytest
 from sfm_app.colmap import mapping
 from sfm_app.colmap.backend import largest_model, pycolmap
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.tasks import global_options
+from sfm_app.colmap.tasks import global_options, remove_runaways
 from sfm_app.errors import BackendError
 
 pytestmark = pytest.mark.slow
@@ -94,6 +94,15 @@ def test_all_photos_at_once_give_the_true_model_the_same_bytes_twice(synthetic, 
     assert written[0] == written[1] and "images.bin" in written[0]
     assert [path.name for path in place.iterdir()] == ["database.db"]
     assert (place / "database.db").read_bytes() == before
+
+
+@pytest.mark.parametrize(("factor", "photos"), [(0.11, 5), (9.0, 5), (11.0, 0), (0.09, 0)])
+def test_photos_whose_focal_runs_away_are_removed(synthetic, factor, photos):
+    before, model = (pycolmap.Reconstruction(synthetic[1]) for _ in range(2))
+    for camera in model.cameras.values():
+        camera.params = [factor * camera.params[0], *camera.params[1:]]
+    remove_runaways(model, before.cameras)
+    assert model.num_reg_images() == photos
 
 
 def test_only_the_photos_asked_for_are_placed_and_of_none_comes_nothing(synthetic):

@@ -172,7 +172,7 @@ def test_a_failed_adjustment_is_named():
         }
     )
 
-    assert "beware: the last adjustment failed (only 3 of 900 points remain); cameras and poses are those of" in text
+    assert "beware: the last adjustment failed (only 3 of 900 points remain), so places and depths are those of" in text
     assert "the last adjustment of other_models/2 failed (no)" in text
     assert "do not determine camera one; it keeps" in text
     assert summary["adjustment"]["cameras_held"] == ["one"]
@@ -219,13 +219,11 @@ def test_look_alikes_and_possible_look_alikes_are_named():
 def test_uncertain_focal_lengths_of_most_photos_are_a_warning():
     unsure = replace(CAMERA, deviations={"fx": 9.0, "fy": 90.1})
     text, _ = describe(cameras=[unsure, unsure, CAMERA])
-    assert "beware: the focal length is uncertain by 10 %, and the depth of the model with it: add photos" in text
-    for cameras in (
-        [unsure, CAMERA, CAMERA],
-        [replace(unsure, deviations={"fx": 40.0})],
-        [replace(unsure, deviations={})],
-    ):
-        assert "focal length is uncertain" not in describe(cameras=cameras)[0]
+    assert "beware: the focal length is uncertain by 10 %, and depths with it: add photos" in text
+    text, _ = describe(cameras=[CAMERA, replace(unsure, deviations={"fx": 90.1}), CAMERA, CAMERA])
+    assert "beware: the focal length of 1.jpg is uncertain by 10 %, and depths with it: add photos" in text
+    for deviations in ({"fx": 40.0}, {}):
+        assert "is uncertain" not in describe(cameras=[replace(unsure, deviations=deviations)])[0]
 
 
 def test_a_camera_for_each_photo_is_named_where_it_was_tried():
