@@ -136,6 +136,15 @@ class OVERLAPS:
     """Photos with a point before another one is expected to have it: two may agree by chance. By definition."""
     behind: float = 1.1
     """Points farther away than others in a cell, by this factor, may be hidden. Chosen by hand."""
+    max_shared: float = 0.1
+    """Share of the expected cells up to which photos without matches do not overlap. Chosen by hand."""
+    below_usual: float = 0.5
+    """Photos do not overlap, either, if their share is lower than the median by this. Chosen by hand; right models of
+    real photos stay above the median less 0.3, photos of a symmetric object on its wrong side below it less 0.5."""
+    pulling_share: float = 0.7
+    """Share of the expected cells from which photos are on one side. Chosen by hand."""
+    min_pairs: int = 10
+    """Non-overlapping pairs that prove a false join. Chosen by hand."""
     min_photos: int = 3
     """Photos on either side of a false join. Chosen by hand."""
     min_own_share: float = 0.35
@@ -146,15 +155,17 @@ class OVERLAPS:
     latter 1."""
     max_passes: int = 3
     """Times that photos are mapped again without more look-alikes. Chosen by hand."""
+    min_missing: float = 0.5
+    """Share of the expected cells across a false join that must be missing. Chosen by hand."""
     usual_percentile: float = 90.0
     """Of the shares of pairs, those within one of several equal sides. Chosen by hand."""
     side_margin: float = 0.1
     """Photos are on one side from this share less this. Chosen by hand."""
     min_judged: int = 10
-    """Photos with enough neighbors across that prove two sides. Chosen by hand."""
+    """Photos with enough neighbors across that prove equal sides. Chosen by hand."""
     missing_ratio: float = 4.2
     """Missing cells across equal sides, in those within. Measured: folded models of books21, oats23 and a palace have
-    4.6 to 6.7, 50 right ones at most 3.8."""
+    4.6 to 6.7, 60 right ones at most 3.8."""
     least_missing: float = 0.02
     """Share of missing cells within sides that always counts. Measured: right models have 0.002 to 0.043."""
 
@@ -357,27 +368,40 @@ logger = logging.getLogger("sfm_app")
 
 
 def judge_places(models: Iterable[Attempt]) -> tuple[list[LookAlikes], int]:
-    """Return the false joins of models, and the number of pairs that should overlap across them."""
-    joins, across = list[LookAlikes](), 0
+    """Return the false joins of models, and their number of non-overlapping pairs."""
+    joins, non_overlapping = list[LookAlikes](), 0
     for attempt in models:
         try:
             with translate_errors("reading points"):
                 points, photos = _read_posed_photos(attempt.model)
                 overlaps = _expected_overlaps(points, photos)
-                divisions = find_sides(overlaps, points, photos)
-            joins += find_false_joins(divisions, overlaps, attempt.explained)
+                equal_sides = find_equal_sides(overlaps, points, photos)
+            joins += find_false_joins(overlaps, attempt.explained, equal_sides)
         except (*FAILURES, BackendError) as err:  # the model itself is there
             logger.info("the places of model %s could not be checked", attempt.note, exc_info=err)
             continue
-        across += sum(len(_split_pairs(overlaps, sides)[1]) for sides in divisions)
-    return joins, across
+        non_overlapping += len(find_non_overlapping(overlaps, attempt.explained))
+        non_overlapping += sum(len(_split_pairs(overlaps, sides)[1]) for sides in equal_sides)
+    return joins, non_overlapping
 
 
-# Sides. Photos of two streets in one place lack each other's points, and photos of equal sides of a palace lack what
-# surrounds them. Photos at the ends of a loop, too, may lack points of each other, but not the same ones of all others.
+def find_non_overlapping(
+    overlaps: Mapping[PairId, ExpectedOverlap], explained: Mapping[PairId, PairSupport]
+) -> dict[PairId, ExpectedOverlap]:
+    """Return the pairs of photos that should overlap, and share next to nothing, or far less than other pairs do."""
+    usual = float(np.median([one.shared / one.expected for one in overlaps.values()])) if overlaps else 0.0
+    return {
+        pair: one for pair, one in overlaps.items()
+        if one.shared < (usual - OVERLAPS.below_usual) * one.expected
+        or (one.shared <= OVERLAPS.max_shared * one.expected and not _is_significant(explained.get(pair)))
+    }  # fmt: skip
 
 
-def find_sides(
+# Equal sides. Where photos of all sides of a palace are on one side of the model, facades match, and what surrounds
+# them does not. Photos at the ends of a loop, too, may lack points of each other, but not the same ones of all others.
+
+
+def find_equal_sides(
     overlaps: Mapping[PairId, ExpectedOverlap], points: FloatArray, photos: Mapping[int, PosedPhotoPoints]
 ) -> list[dict[int, int]]:
     """Return divisions of the photos, 1 or -1 by photo, where far more is missing across than within the sides."""
@@ -388,7 +412,7 @@ def find_sides(
         group = waiting.pop()
         if all(_affinity(one, pulling) >= 0 for one in group.values()):
             continue
-        sides = _assign_sides(group, pulling)
+        sides = _assign_sides(group, group, pulling)
         within, across = _split_pairs(group, sides)
         usual, between = (_compare_with_all(pairs, points, photos) for pairs in (within, across))
         most = OVERLAPS.missing_ratio * max(_missing_share(usual), OVERLAPS.least_missing)
@@ -418,18 +442,32 @@ def _compare_with_all(
 
 
 def find_false_joins(
-    divisions: Iterable[Mapping[int, int]], overlaps: Mapping[PairId, ExpectedOverlap],
-    explained: Mapping[PairId, PairSupport],
+    overlaps: Mapping[PairId, ExpectedOverlap], explained: Mapping[PairId, PairSupport],
+    equal_sides: Iterable[Mapping[int, int]] = (),
 ) -> list[LookAlikes]:  # fmt: skip
-    """Return the pairs that hold the sides of each division together: the least cut between them."""
-    significant = {pair: one.matches for pair, one in explained.items() if one.matches >= SPLIT.min_matches}
+    """Return the pairs that hold non-overlapping photos or equal sides together, each false join by itself."""
+    non_overlapping, joins = find_non_overlapping(overlaps, explained), list[LookAlikes]()
+    significant = {pair: one.matches for pair, one in explained.items() if _is_significant(one)}
     strengths = dict(zip(significant, saturate(list(significant.values())).tolist(), strict=True))
-    photos, joins = sorted(set(chain(*significant, *overlaps))), list[LookAlikes]()
-    for sides in divisions:
-        here = _cut_sides(sides, photos, strengths)
+    photos, remaining = sorted(set(chain(*significant, *overlaps))), dict(non_overlapping)
+    while len(remaining) >= OVERLAPS.min_pairs:
+        sides = _assign_sides(remaining, overlaps, OVERLAPS.pulling_share)
+        apart = {
+            pair for pair in _split_pairs(overlaps, sides)[1] if _affinity(overlaps[pair], OVERLAPS.pulling_share) < 0
+        }
+        here = _cut_sides({photo: sides[photo] for photo in chain(*apart)}, photos, strengths)
+        across = {pair: one for pair, one in overlaps.items() if {here.get(photo) for photo in pair} == {True, False}}
+        missing = _missing_share(across.values())
+        if len(across.keys() & non_overlapping.keys()) >= OVERLAPS.min_pairs and missing >= OVERLAPS.min_missing:
+            pairs = {pair for pair in strengths if here[pair[0]] != here[pair[1]]}
+            strengths = {pair: strength for pair, strength in strengths.items() if pair not in pairs}
+            joins += [LookAlikes(join, missing) for join in group_doubted_pairs(pairs, strengths)]
+        remaining = {pair: remaining[pair] for pair in _split_pairs(remaining, sides)[0]}
+    for division in equal_sides:
+        here = _cut_sides(division, photos, strengths)
         if pairs := {pair for pair in strengths if here and here[pair[0]] != here[pair[1]]}:
             strengths = {pair: strength for pair, strength in strengths.items() if pair not in pairs}
-            missing = _missing_share([overlaps[pair] for pair in _split_pairs(overlaps, sides)[1]])
+            missing = _missing_share([overlaps[pair] for pair in _split_pairs(overlaps, division)[1]])
             joins += [LookAlikes(join, missing) for join in group_doubted_pairs(pairs, strengths)]
     return joins
 
@@ -438,17 +476,23 @@ def _missing_share(overlaps: Collection[ExpectedOverlap]) -> float:
     return 1.0 - sum(one.shared for one in overlaps) / max(sum(one.expected for one in overlaps), 1)
 
 
+def _is_significant(pair: PairSupport | None) -> bool:
+    return pair is not None and pair.matches >= SPLIT.min_matches
+
+
 def _affinity(overlap: ExpectedOverlap, pulling_share: float) -> float:
     """Return how many cells speak for one place, less those that speak for two."""
     return overlap.shared - pulling_share * overlap.expected
 
 
-def _assign_sides(overlaps: Mapping[PairId, ExpectedOverlap], pulling_share: float) -> dict[int, int]:
+def _assign_sides(
+    apart: Iterable[PairId], overlaps: Mapping[PairId, ExpectedOverlap], pulling_share: float
+) -> dict[int, int]:
     """Return the side, 1 or -1, of all photos with overlaps, the surest first."""
     affinities: dict[int, dict[int, float]] = {photo: {} for photo in chain(*overlaps)}
     for (a, b), one in overlaps.items():
         affinities[a][b] = affinities[b][a] = _affinity(one, pulling_share)
-    seed = min(overlaps, key=lambda pair: (affinities[pair[0]][pair[1]], pair))
+    seed = min(apart, key=lambda pair: (affinities[pair[0]][pair[1]], pair))
     sides, votes = dict[int, int](), dict.fromkeys(sorted(affinities), 0.0)
     waiting = [(-np.inf, seed[0], np.inf), (-np.inf, seed[1], -np.inf), *((0.0, photo, 0.0) for photo in votes)]
     heapify(waiting)
