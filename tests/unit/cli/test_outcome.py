@@ -122,7 +122,7 @@ def test_only_the_first_missing_photos_are_named(finished):
 
 @pytest.mark.parametrize(
     ("deviation", "text"),
-    [(20.0, "all photos together do"), (30.0, "nor do all photos together"), (None, "this is a guess: an orbit")],
+    [(16.0, "all photos together do"), (18.0, "nor do all photos together"), (None, "this is a guess: an orbit")],
 )
 def test_a_camera_that_pairs_do_not_determine_is_marked(finished, deviation, text):
     refined = {"one": replace(REFINED, deviations={"fx": deviation})}

@@ -222,7 +222,7 @@ def test_uncertain_focal_lengths_of_most_photos_are_a_warning():
     assert "beware: the focal length is uncertain by 10 %, and depths with it: add photos" in text
     text, _ = describe(cameras=[CAMERA, replace(unsure, deviations={"fx": 90.1}), CAMERA, CAMERA])
     assert "beware: the focal length of 1.jpg is uncertain by 10 %, and depths with it: add photos" in text
-    for deviations in ({"fx": 40.0}, {}):
+    for deviations in ({"fx": 29.0}, {}):
         assert "is uncertain" not in describe(cameras=[replace(unsure, deviations=deviations)])[0]
 
 
