@@ -7,6 +7,7 @@ looser ratio test give more there. For all photos they would cost too much.
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from sfm_app.mapping.passes import Outcome
 from sfm_app.matching.features import fill_database
 from sfm_app.plugins import SIFT_AFFINE
 from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.cost_estimate import duration_text, finer_minutes
 from sfm_app.runtime.workspace import SubWorkspace
 from sfm_app.types import Evidence, MatchGraph, PairId
 from sfm_app.types.arrays import FloatArray, IndexArray
@@ -110,6 +112,10 @@ def find_finer_evidence(best: Outcome, run: RunContext) -> tuple[Evidence, RunCo
     """
     first, matching = replace(best.evidence, intrinsics=best.calibrated), run.settings.matching
     pairs = candidate_pairs(lost_photos(best, run), first.matches)
+    tried = set(chain(*pairs))
+    sizes = [(image.width, image.height) for key, image in first.matches.images.items() if key in tried]
+    minutes = finer_minutes(sizes, run.settings, run.workers)
+    run.progress.say(f"finer features of {len(sizes)} photos: {duration_text(minutes)} more")
     looser = matching.model_copy(update={"max_ratio": max(OPTIONS.max_ratio, matching.max_ratio)})
     run = replace(
         run,

@@ -36,6 +36,8 @@ class OPTIONS:
     """Memory of the tetrahedra and their surface per fused point of a block. Measured."""
     depth_seconds_per_mp: float = 1.2
     """Core seconds of depth maps per neighbor. Measured."""
+    finer_seconds_per_mp: float = 3.5
+    """Core seconds of finer features, their matches and models. Measured on bathtub23."""
     refine_seconds_per_mp: float = 1.0
     """Core seconds of the surface's refinement. Measured."""
     refine_mb: float = 200.0
@@ -67,14 +69,25 @@ class Plan:
         """Return photos, pairs, time, memory and workers in words."""
         names = list(stages)
         minutes, gigabytes = self.minutes(names), self.peak_mb(names) / 1000
-        duration = "a minute or two" if minutes > 0.6 else "a minute at most"
-        if minutes >= 1.5:
-            step = 1 if minutes < 10 else 5 if minutes < 60 else 10
-            duration = f"about {max(1, round(minutes / step) * step)} minutes"
+        duration = duration_text(minutes)
         workers = f"{self.workers} worker{'s' if self.workers > 1 else ''}"
         hard = " or more" if minutes >= 1.5 and "scene" in names else ""  # photos may be hard to place
         size = f"{self.photos} photos, {self.pairs} pair{'' if self.pairs == 1 else 's'}"
         return f"{size}: {duration}{hard}; {gigabytes:.1f} GB with {workers}"
+
+
+def duration_text(minutes: float) -> str:
+    """Return expected minutes in words."""
+    if minutes < 1.5:
+        return "a minute or two" if minutes > 0.6 else "a minute at most"
+    step = 1 if minutes < 10 else 5 if minutes < 60 else 10
+    return f"about {max(1, round(minutes / step) * step)} minutes"
+
+
+def finer_minutes(sizes: Iterable[tuple[int, int]], settings: Settings, workers: int) -> float:
+    """Return how many minutes finer features of photos of these sizes take."""
+    searched = sum(_megapixels(size, settings.matching.max_image_size_px) for size in sizes)
+    return OPTIONS.finer_seconds_per_mp * searched / workers / 60
 
 
 def largest_photo_megapixels(limit_mb: float) -> float:

@@ -85,3 +85,19 @@ def test_two_hundred_photos_of_twelve_megapixels_need_no_more_than_eight_gigabyt
 
 def test_the_estimate_knows_how_many_photos_the_refinement_holds():
     assert cost_estimate.REFINED_AT_ONCE_MP * 1e6 == MOST_KEPT_PX
+
+
+def test_finer_features_cost_minutes_by_pixels_and_workers():
+    sizes = [(1200, 1600)] * 23
+    alone, two = (cost_estimate.finer_minutes(sizes, Settings(), workers) for workers in (1, 2))
+    assert 2.0 < alone < 4.0 and two == pytest.approx(alone / 2)
+    capped = Settings.model_validate({"matching": {"max_image_size_px": 800}})
+    assert cost_estimate.finer_minutes(sizes, capped, 1) == pytest.approx(alone / 4)
+
+
+@pytest.mark.parametrize(
+    ("minutes", "text"),
+    [(0.5, "a minute at most"), (1.4, "a minute or two"), (2.6, "about 3 minutes"), (13.0, "about 15 minutes")],
+)
+def test_expected_minutes_are_rounded_in_words(minutes, text):
+    assert cost_estimate.duration_text(minutes) == text
