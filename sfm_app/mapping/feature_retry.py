@@ -21,7 +21,7 @@ from sfm_app.mapping.passes import Outcome
 from sfm_app.matching.features import fill_database
 from sfm_app.plugins import SIFT_AFFINE
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.cost_estimate import duration_text, finer_minutes
+from sfm_app.runtime.cost_estimate import finer_minutes, minutes_text
 from sfm_app.runtime.workspace import SubWorkspace
 from sfm_app.types import Evidence, MatchGraph, PairId
 from sfm_app.types.arrays import FloatArray, IndexArray
@@ -115,7 +115,7 @@ def find_finer_evidence(best: Outcome, run: RunContext) -> tuple[Evidence, RunCo
     tried = set(chain(*pairs))
     sizes = [(image.width, image.height) for key, image in first.matches.images.items() if key in tried]
     minutes = finer_minutes(sizes, run.settings, run.workers)
-    run.progress.say(f"finer features of {len(sizes)} photos: {duration_text(minutes)} more")
+    run.progress.say(f"finer features of {len(sizes)} photos: {minutes_text(minutes)} more")
     looser = matching.model_copy(update={"max_ratio": max(OPTIONS.max_ratio, matching.max_ratio)})
     run = replace(
         run,

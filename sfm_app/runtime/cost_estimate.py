@@ -69,14 +69,14 @@ class Plan:
         """Return photos, pairs, time, memory and workers in words."""
         names = list(stages)
         minutes, gigabytes = self.minutes(names), self.peak_mb(names) / 1000
-        duration = duration_text(minutes)
+        duration = minutes_text(minutes)
         workers = f"{self.workers} worker{'s' if self.workers > 1 else ''}"
         hard = " or more" if minutes >= 1.5 and "scene" in names else ""  # photos may be hard to place
         size = f"{self.photos} photos, {self.pairs} pair{'' if self.pairs == 1 else 's'}"
         return f"{size}: {duration}{hard}; {gigabytes:.1f} GB with {workers}"
 
 
-def duration_text(minutes: float) -> str:
+def minutes_text(minutes: float) -> str:
     """Return expected minutes in words."""
     if minutes < 1.5:
         return "a minute or two" if minutes > 0.6 else "a minute at most"

@@ -100,4 +100,4 @@ def test_finer_features_cost_minutes_by_pixels_and_workers():
     [(0.5, "a minute at most"), (1.4, "a minute or two"), (2.6, "about 3 minutes"), (13.0, "about 15 minutes")],
 )
 def test_expected_minutes_are_rounded_in_words(minutes, text):
-    assert cost_estimate.duration_text(minutes) == text
+    assert cost_estimate.minutes_text(minutes) == text
