@@ -173,13 +173,13 @@ class FocalGrid:
         best = one = np.zeros(self.count, np.int64)
         most = self.fit(one) + log_probability(one)
         for cut in np.unique(own)[1:]:
-            labels = self._assign(self.places(start := (own < cut).astype(np.int64), self.rows), start)
+            labels = self.assign(self.places(start := (own < cut).astype(np.int64), self.rows), start)
             while np.ptp(labels) and (value := self.fit(labels) + log_probability(labels)) > most:
                 best, most = labels, value
-                labels = self._assign(self.places(labels, self.rows), labels)
+                labels = self.assign(self.places(labels, self.rows), labels)
         return best
 
-    def _assign(self, places: IndexArray, labels: IndexArray) -> IndexArray:
+    def assign(self, places: IndexArray, labels: IndexArray) -> IndexArray:
         """Give every photo in turn the more probable of two cameras, until none changes."""
         # both directions of every pair, by the photo that they begin with
         ends = np.concatenate([self.members, self.members[:, ::-1]])
@@ -191,7 +191,7 @@ class FocalGrid:
         while changed:
             changed = False
             for photo in range(len(labels)):
-                own = slice(starts[photo], starts[photo + 1])
+                own = np.arange(starts[photo], starts[photo + 1])
                 counts = np.bincount(labels, minlength=2)
                 counts[labels[photo]] -= 1
                 values = gains[own, 0, labels[neighbors[own]]].sum(), gains[own, 1, labels[neighbors[own]]].sum()

@@ -1,12 +1,14 @@
 """Photos of one size that are of one camera, of two, or each of its own."""
 
 from dataclasses import replace
+from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sfm_app.selfcal.groups import VoteTables
-from sfm_app.selfcal.other_cameras import divide_photos, log_probability
+from sfm_app.selfcal.other_cameras import FocalGrid, divide_photos, log_probability
 from sfm_app.selfcal.pairs import LOG_FOCAL
 
 slow = pytest.mark.slow
@@ -176,3 +178,23 @@ def test_probabilities_of_divisions_add_to_one():
     """All ways to divide four photos: one of 4, four of 3 + 1, three of 2 + 2, six of 2 + 1 + 1, one of singles."""
     ways = [([0, 0, 0, 0], 1), ([0, 0, 0, 1], 4), ([0, 0, 1, 1], 3), ([0, 0, 1, 2], 6), ([0, 1, 2, 3], 1)]
     assert sum(count * np.exp(log_probability(np.array(labels))) for labels, count in ways) == pytest.approx(1.0)
+
+
+def test_no_photo_would_rather_have_the_other_of_two_cameras():
+    rng, photos = np.random.default_rng(0), 9
+    members = np.array([pair for pair in combinations(range(photos), 2) if rng.uniform() < 0.6])
+    tables = SimpleNamespace(weights=np.ones(len(members)), votes=lambda *_: rng.exponential(0.03, 81**2))
+    grid = FocalGrid(tables, np.arange(len(members)), np.zeros(5), members)
+    for cut in range(1, photos):
+        places = rng.integers(81, size=2)
+
+        def log_odds(labels, places=places):
+            gains = grid.gains[np.arange(len(members)), *places[labels[members]].T]
+            return gains.sum() + log_probability(labels)
+
+        labels = grid.assign(places, (np.arange(photos) < cut).astype(np.int64))
+        assert log_odds(labels) >= log_odds((np.arange(photos) < cut).astype(np.int64))
+        for photo in range(photos):
+            other = labels.copy()
+            other[photo] = 1 - other[photo]
+            assert log_odds(other) <= log_odds(labels) + 1e-9
