@@ -196,7 +196,7 @@ class FocalGrid:
                 counts[labels[photo]] -= 1
                 values = gains[own, 0, labels[neighbors[own]]].sum(), gains[own, 1, labels[neighbors[own]]].sum()
                 advantage = np.diff(np.array(values) + np.log(np.maximum(counts, 1)))[0]
-                if (advantage > 0.0) if labels[photo] == 0 else (advantage < 0.0):
+                if (advantage if labels[photo] == 0 else -advantage) > 1e-9:  # equal sums may differ by rounding
                     labels[photo], changed = 1 - labels[photo], True
         return labels
 
