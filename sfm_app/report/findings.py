@@ -158,14 +158,15 @@ def plain_text(line: str) -> str:
 
 
 def unknown_cameras(contents: RunContents) -> list[str]:
-    """Return reason, used value and remedy for each undetermined camera."""
-    cameras = contents.intrinsics.cameras if contents.intrinsics is not None else {}
-    after = contents.scene.cameras if contents.scene is not None else {}
+    """Return reason, used value and remedy for each undetermined camera of a run without a scene."""
+    if contents.intrinsics is None or contents.scene is not None:  # a scene states how sure its own cameras are
+        return []
+    cameras = contents.intrinsics.cameras
     return [
         f"Pairs of photos do not determine the camera{f' {name}' if len(cameras) > 1 else ''}: {camera.reason}. "
         f"A focal of {camera.focal_px:.0f} px is {SOURCES.get(camera.method, camera.method)}. What to do: {REMEDY}."
         for name, camera in cameras.items()
-        if not camera.identifiable and (name in after or not after)
+        if not camera.identifiable
     ]
 
 

@@ -104,19 +104,11 @@ def test_a_camera_that_pairs_do_not_determine_comes_with_what_to_do():
     assert "What to do: add photos" in text
 
 
-def test_a_camera_of_no_placed_photo_is_passed_over():
-    K = np.diag([768.0, 768.0, 1.0])
-    camera = Calibration(K, 640, 480, "guess", identifiable=False, reason="an orbit")
-    cameras = {"b": CameraModel("PINHOLE", (), K, 640, 480)}
-
-    def warnings_with(found):
-        scene = SimpleNamespace(cameras=found)
-        return unknown_cameras(
-            SimpleNamespace(intrinsics=SimpleNamespace(cameras={"a": camera, "b": camera}), scene=scene)
-        )
-
-    assert [text.split(":")[0][-1] for text in warnings_with(cameras)] == ["b"]
-    assert len(warnings_with({})) == 2
+def test_a_scene_states_how_sure_its_cameras_are():
+    guess = Calibration(np.diag([768.0, 768.0, 1.0]), 640, 480, "guess", identifiable=False, reason="an orbit")
+    intrinsics = SimpleNamespace(cameras={"a": guess, "b": guess})
+    assert len(unknown_cameras(SimpleNamespace(intrinsics=intrinsics, scene=None))) == 2
+    assert unknown_cameras(SimpleNamespace(intrinsics=intrinsics, scene=SimpleNamespace())) == []
 
 
 @pytest.mark.parametrize(("unusable", "more"), [(0, ""), (2, "and 2 unusable")])
