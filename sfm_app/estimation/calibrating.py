@@ -69,11 +69,12 @@ def select_inliers_through_lens(
         fit = views.fits[pair]
         try:
             lenses = [known[photo] for photo in pair]
-            inliers = select_inliers(matches.points(pair), lenses, fit.inliers, max_error_px)
+            inliers, degeneracy = select_inliers(matches.points(pair), lenses, fit.inliers, max_error_px)
         except FAILURES as err:
             logger.info("the inliers of pair %s could not be selected through the lens", pair, exc_info=err)
             return fit
-        return replace(fit, inliers=inliers) if inliers.sum() >= OPTIONS.min_kept * fit.inlier_count else fit
+        enough = inliers.sum() >= OPTIONS.min_kept * fit.inlier_count
+        return replace(fit, inliers=inliers if enough else fit.inliers, degeneracy=degeneracy)
 
     selected = dict(zip(pairs, run.map(choose, pairs, "matches through the lens"), strict=True))
     return replace(views, fits={pair: selected.get(pair, fit) for pair, fit in views.fits.items()})
@@ -89,11 +90,12 @@ def find_intrinsics(matches: MatchGraph, views: ViewGraph, run: RunContext) -> I
     """Find K and lens of every camera, and the camera of every photo; unidentifiable cameras become a guess."""
     sample = sample_pairs(views, len(matches.images))
     run.record(pairs_asked=len(sample.fits))
-    cameras = _calibrate(matches, sample, run)
+    cameras, straight = _calibrate(matches, sample, run), views
     for _ in range(OPTIONS.lens_rounds):
         selected = select_inliers_through_lens(matches, sample, _of_whole_photos(cameras, matches), run)
         if selected is sample:
             break
+        straight = replace(views, fits={**views.fits, **selected.fits})
         before, cameras = cameras, _calibrate(matches, selected, run, cameras)
         if _agree(before, cameras):
             break
@@ -102,7 +104,7 @@ def find_intrinsics(matches: MatchGraph, views: ViewGraph, run: RunContext) -> I
         cameras.append(CalibratedCamera(group, tuple(image.id for image in images if image.group == group), lens))
     report_claims({camera.name: _claim(camera, matches) for camera in cameras}, run)
     cameras = _take_given_cameras(cameras, matches, run)
-    return to_intrinsics((replace(camera, found=explain_failure(camera, views)) for camera in cameras), matches)
+    return to_intrinsics((replace(camera, found=explain_failure(camera, straight)) for camera in cameras), matches)
 
 
 def _agree(before: Sequence[CalibratedCamera], after: Sequence[CalibratedCamera]) -> bool:

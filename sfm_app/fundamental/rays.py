@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from sfm_app.camera.bearings import bearings
-from sfm_app.fundamental.a_contrario import MOST_FALSE_ALARMS, model_false_alarms
-from sfm_app.fundamental.degeneracy import DEGENERACY
+from sfm_app.fundamental.a_contrario import MOST_FALSE_ALARMS, model_false_alarms, squared_mismatch_distances
+from sfm_app.fundamental.degeneracy import DEGENERACY, find_degeneracy
 from sfm_app.fundamental.estimate import CHANCE, NO_MODEL, TOO_FEW_INLIERS, TOO_FEW_MATCHES
 from sfm_app.fundamental.lev_ransac import OPTIONS as LEV_RANSAC
 from sfm_app.fundamental.leverage import cook_distances, mad_sigma, priors, studentized_residuals
@@ -65,14 +65,24 @@ def fit_lev_ransac_rays(lines: FloatArray, options: EpipolarSettings, seed: int)
 
 def select_inliers(
     points: Sequence[FloatArray], cameras: Sequence[Calibration], inliers: BoolArray, threshold: float
-) -> BoolArray:
-    """Return (N,) the matches (N, 2), (N, 2) that agree with the F of rays of some of them; no focal is assumed."""
+) -> tuple[BoolArray, str]:
+    """Return (N,) the matches (N, 2), (N, 2) that agree with the F of rays of some of them; no focal is assumed.
+
+    Also return their degeneracy without the bending of lenses, which hides planes, as of `find_degeneracy`.
+    """
     lines = np.hstack([bearings(x, camera) for x, camera in zip(points, cameras, strict=True)])
     agreeing, slope = inliers, np.ones(len(lines))
     for _ in range(OPTIONS.rounds):
         F = epipolar.fit_rays(lines[:, epipolar.FIRST], lines[:, epipolar.SECOND], agreeing * slope**-2.0)
         agreeing, slope = epipolar.squared_distances(F[None], lines)[0] <= threshold**2, epipolar.gradients(F, lines)
-    return agreeing
+    if np.count_nonzero(agreeing) < RAY_SAMPLE_SIZE:
+        return agreeing, ""
+    unit_px = float(np.mean([camera.focal_px for camera in cameras]))
+    straight = np.asfortranarray(
+        np.hstack([lines[:, ray][:, :2] / lines[:, ray][:, 2:] for ray in (epipolar.FIRST, epipolar.SECOND)])
+    )
+    wrong = squared_mismatch_distances(straight, np.ascontiguousarray(F).reshape(9))
+    return agreeing, find_degeneracy(straight, F, agreeing, wrong, threshold / unit_px, np.zeros(4))
 
 
 def validity(lines: FloatArray, E: FloatArray, threshold: float) -> FloatArray:
