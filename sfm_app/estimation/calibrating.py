@@ -74,7 +74,7 @@ def select_inliers_through_lens(
             logger.info("the inliers of pair %s could not be selected through the lens", pair, exc_info=err)
             return fit
         enough = inliers.sum() >= OPTIONS.min_kept * fit.inlier_count
-        return replace(fit, inliers=inliers if enough else fit.inliers, degeneracy=degeneracy)
+        return replace(fit, inliers=inliers, degeneracy=degeneracy) if enough else fit
 
     selected = dict(zip(pairs, run.map(choose, pairs, "matches through the lens"), strict=True))
     return replace(views, fits={pair: selected.get(pair, fit) for pair, fit in views.fits.items()})
