@@ -67,10 +67,12 @@ def lift_eigenvalues(
         values, vectors = np.linalg.eigh(S / pairs)
     else:  # no eigenvalue is below, and this costs a tenth of computing them
         return S
-    singular = np.any(values < least, axis=-1, keepdims=True)[..., None]
+    # only a matrix with negative eigenvalues has one above its size: what is far below that is rounding
+    floor = least * np.maximum(1.0, values[..., -1:] / S.shape[-1])
+    singular = np.any(values < floor, axis=-1, keepdims=True)[..., None]
     if not singular.any():
         return S
-    raised = np.where(values < least, to, values)
+    raised = np.where(values < floor, np.maximum(to, floor), values)
     return np.where(singular, np.einsum("...ik,...k,...jk->...ij", vectors, raised, vectors) * pairs, S)
 
 

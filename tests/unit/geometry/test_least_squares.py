@@ -75,6 +75,13 @@ def test_what_is_positive_is_left_as_it_is_and_what_is_not_becomes_so():
     assert np.abs(solve_each(bad, np.ones((4, 5, 1)))[1:3]).max() <= 2.0
 
 
+def test_matrices_that_are_far_from_positive_have_an_inverse():
+    v = 1.0 + 0.02 * np.random.default_rng(0).uniform(size=(3000, 5))
+    S = 2e14 * v[:, :, None] * v[:, None, :]
+    S[:, 0, 0], S[:, 4, 4] = 2.0, 4e40
+    assert np.isfinite(inverses_of_positive(S)).all()
+
+
 def test_rounding_leaves_no_less_than_nothing():
     S = np.diag([1.0, -1e-9, 2.0])
     found = project_to_psd(S, np.array([1.0, 1e3, 2.0]))
