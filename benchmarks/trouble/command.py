@@ -36,6 +36,7 @@ from benchmarks.corpus.report import GAINS_TEXT, hypothesis_rows
 from benchmarks.corpus.score import Doubt, parameter_errors
 from benchmarks.synthetic.hard import HARD
 from benchmarks.synthetic.trouble import KINDS, troubled_folder, write_troubled_folder
+from sfm_app.frame.upright import turn_camera
 from sfm_app.products import read_scene
 from sfm_app.report.text import place_warnings
 from sfm_app.runtime.workspace import Workspace
@@ -163,7 +164,7 @@ def laid_photos(out: Path) -> set[str]:
 
 def lay(photo: TruePhoto) -> TruePhoto:
     """Return the camera of an upright photo after a quarter turn to the left."""
-    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    turn = turn_camera(np.eye(3), -90)
     moved = np.array([turn[0], [-1.0, 0.0, photo.width], turn[2]])
     return photo._replace(K=moved @ photo.K @ turn.T, pose=turn @ photo.pose)
 

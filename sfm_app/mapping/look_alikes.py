@@ -450,6 +450,13 @@ def find_false_joins(
     significant = {pair: one.matches for pair, one in explained.items() if _is_significant(one)}
     strengths = dict(zip(significant, saturate(list(significant.values())).tolist(), strict=True))
     photos, remaining = sorted(set(chain(*significant, *overlaps))), dict(non_overlapping)
+
+    def separate(here: Mapping[int, bool], missing: float) -> None:
+        pairs = {pair for pair in strengths if here[pair[0]] != here[pair[1]]}
+        for pair in pairs:
+            del strengths[pair]
+        joins.extend(LookAlikes(join, missing) for join in group_doubted_pairs(pairs, strengths))
+
     while len(remaining) >= OVERLAPS.min_pairs:
         sides = _assign_sides(remaining, overlaps, OVERLAPS.pulling_share)
         apart = {
@@ -459,16 +466,11 @@ def find_false_joins(
         across = {pair: one for pair, one in overlaps.items() if {here.get(photo) for photo in pair} == {True, False}}
         missing = _missing_share(across.values())
         if len(across.keys() & non_overlapping.keys()) >= OVERLAPS.min_pairs and missing >= OVERLAPS.min_missing:
-            pairs = {pair for pair in strengths if here[pair[0]] != here[pair[1]]}
-            strengths = {pair: strength for pair, strength in strengths.items() if pair not in pairs}
-            joins += [LookAlikes(join, missing) for join in group_doubted_pairs(pairs, strengths)]
+            separate(here, missing)
         remaining = {pair: remaining[pair] for pair in _split_pairs(remaining, sides)[0]}
     for division in equal_sides:
-        here = _cut_sides(division, photos, strengths)
-        if pairs := {pair for pair in strengths if here and here[pair[0]] != here[pair[1]]}:
-            strengths = {pair: strength for pair, strength in strengths.items() if pair not in pairs}
-            missing = _missing_share([overlaps[pair] for pair in _split_pairs(overlaps, division)[1]])
-            joins += [LookAlikes(join, missing) for join in group_doubted_pairs(pairs, strengths)]
+        if here := _cut_sides(division, photos, strengths):
+            separate(here, _missing_share([overlaps[pair] for pair in _split_pairs(overlaps, division)[1]]))
     return joins
 
 

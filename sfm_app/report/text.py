@@ -23,11 +23,8 @@ HELD = {
     "k1": "a lens that bends no lines",
 }
 """Assumed value, by parameter."""
-REMEDY = (
-    "add photos from nearer, farther and other heights, some with the camera turned on its side, or give a known "
-    "camera with --calibration FILE"
-)
-"""For a camera that photos do not determine."""
+REMEDY = "add photos from nearer, farther and higher, some turned on their side, or use --calibration FILE"
+"""For a camera that photos do not determine; short, since the terminal cuts warnings."""
 UNSURE_FOCAL = 1.0 / 30.0
 """Relative deviation of a focal above which photos do not determine it: three deviations change depths by a tenth."""
 WARNING = "beware: "

@@ -31,7 +31,7 @@ class CameraModel:
     @property
     def focal_doubt(self) -> float:
         """Standard deviation of the focal length as a share of it; 0 if none is stated."""
-        return max((self.deviations.get(name, 0.0) / self.K[k, k] for k, name in enumerate(("fx", "fy"))), default=0.0)
+        return max(self.deviations.get(name, 0.0) / float(self.K[k, k]) for k, name in enumerate(("fx", "fy")))
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON values."""
