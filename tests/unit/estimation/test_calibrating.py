@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from benchmarks.lenses.distortion import calibrate, photograph
-from sfm_app.camera.bearings import project
+from sfm_app.camera.models import FAMILIES, row_of_calibration
+from sfm_app.camera.projection import image_points
 from sfm_app.estimation import calibrating as module
 from sfm_app.estimation.calibrating import sample_pairs, select_inliers_through_lens
-from sfm_app.fundamental.rays import select_inliers
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
@@ -19,6 +19,7 @@ from sfm_app.settings import Settings
 from sfm_app.stages import view_graph
 from sfm_app.synthetic.cameras import Lens, axis_rotation
 from sfm_app.types import Calibration, EpipolarFit, ViewGraph
+from sfm_app.types.camera import PERSPECTIVE
 
 
 def row_of_photos(photos, reach, degenerate=()):
@@ -101,14 +102,20 @@ def test_a_wrong_lens_takes_no_inliers_away(bent):
 
 @pytest.mark.parametrize(("relief", "kind"), [(0.0, "planar"), (2.0, "")])
 def test_a_plane_is_a_plane_through_a_lens_that_bends_it(bent, relief, kind):
-    K = bent[2]
+    matches, _, K, run = bent
     rng, lens = np.random.default_rng(0), Calibration(K, 1200, 900, "zero-curves", True, distortion=(-0.2,))
     X = np.column_stack([rng.uniform([-3, -2], [3, 2], (400, 2)), 6 + relief * rng.uniform(size=400)])
     turn = axis_rotation(np.array([0.0, 1.0, 0.0]), 20.0)
-    x = [project(X, lens), project(X @ turn.T - [2.0, 0.3, -0.5], lens)]
+    row, family = row_of_calibration(lens), FAMILIES[PERSPECTIVE]
+    x = [image_points(points, row, family) for points in (X, X @ turn.T - [2.0, 0.3, -0.5])]
     inside = np.logical_and(*(((view > 0) & (view < [1200, 900])).all(axis=1) for view in x))
-    inliers, found = select_inliers([view[inside] for view in x], [lens, lens], np.ones(inside.sum(), bool), 2.0)
-    assert inside.sum() > 100 and inliers.mean() > 0.9 and found == kind
+    count = int(inside.sum())
+    rows = np.repeat(np.arange(count, dtype=np.uint32)[:, None], 2, axis=1)
+    images = {number: matches.images[number] for number in (1, 2)}
+    flat = type(matches)(images, {1: x[0][inside], 2: x[1][inside]}, {(1, 2): rows})
+    views = ViewGraph({(1, 2): EpipolarFit(np.eye(3), np.ones(count, bool), np.ones(count), 1, 0.3)}, {})
+    again = select_inliers_through_lens(flat, views, [CalibratedCamera("one", (1, 2), lens)], run).fits[1, 2]
+    assert count > 100 and again.inlier_count == count and again.degeneracy == kind
 
 
 @pytest.mark.slow
