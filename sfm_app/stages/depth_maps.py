@@ -18,10 +18,10 @@ from sfm_app.meshing.visibility import SKY
 from sfm_app.runtime.context import RunContext
 from sfm_app.stereo import DepthMap, DepthTask, View, rank_neighbors
 from sfm_app.stereo.outlines import sharpen_outlines
-from sfm_app.stereo.sky import PhotoAreas, blank_areas, count_votes, find_skies, sky_pixels
+from sfm_app.stereo.sky import PhotoAreas, blank_areas, compare_areas, find_skies, sky_pixels
 from sfm_app.tasks import Shared, Task
 from sfm_app.types import Scene
-from sfm_app.types.arrays import BoolArray, FloatArray
+from sfm_app.types.arrays import BoolArray
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
 
@@ -87,8 +87,7 @@ def detect_skies(dense_dir: Path, views: Sequence[View], run: RunContext) -> dic
     """Return the cells of sky of the photos that have a map, by the number of the photo."""
     mapped = _mapped(dense_dir, views)
     areas = run.map(Task(_find_blank_areas, dense_dir), [views[number] for number in mapped], "detecting the sky")
-    voters = Shared((areas, [views[number] for number in mapped]))
-    votes = run.map(Task(_count_votes, voters), range(len(mapped)), "comparing skies")
+    votes = compare_areas(areas, [views[number] for number in mapped], run.map)
     return {str(number): sky for number, sky in zip(mapped, find_skies(areas, votes), strict=True)}
 
 
@@ -98,10 +97,6 @@ def _mapped(dense_dir: Path, views: Sequence[View]) -> list[int]:
 
 def _find_blank_areas(dense_dir: Path, view: View) -> PhotoAreas:
     return blank_areas(dense.read_gray(dense_dir, view), dense.read_depth(dense_dir, view, "geometric"))
-
-
-def _count_votes(photos: Shared[tuple[Sequence[PhotoAreas], Sequence[View]]], index: int) -> FloatArray:
-    return count_votes(*photos.value, index)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,18 +1,19 @@
 """The depth-map method for every machine."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.settings import AS_NEEDED, DepthSettings
 from sfm_app.stereo.depth import OPTIONS as DEPTH_OPTIONS
 from sfm_app.stereo.depth import confirm_depths, match_depths
 from sfm_app.stereo.plane_proposals import add_depths, agreed_proposals, propose_planes
-from sfm_app.stereo.sky import blank_areas, near_pixels
+from sfm_app.stereo.sky import PhotoAreas, blank_areas, compare_areas, near_pixels, possible_skies, to_cells
 from sfm_app.stereo.view import DepthEstimate, DepthMap, DepthStore, DepthTask, GrayImage, View
-from sfm_app.tasks import Shared, Task
+from sfm_app.tasks import ParallelMap, Shared, Task
 from sfm_app.types import Rejected
 from sfm_app.types.arrays import BoolArray, DepthArray
 
@@ -37,6 +38,12 @@ class _Inputs:
     options: DepthSettings
     store: DepthStore
     steps: Steps
+    closed: Mapping[int, BoolArray] = field(default_factory=dict[int, BoolArray])
+    """Cells of possible skies, by the number of the photo: they are not filled."""
+
+    def closed_pixels(self, index: int, shape: tuple[int, ...]) -> BoolArray:
+        """Mark the pixels of a photo of a shape (H, W) that are not filled."""
+        return near_pixels(self.closed.get(index, np.zeros((1, 1), np.bool_)), shape)
 
     def tolerance(self, level: int) -> float:
         """Return the relative difference of depths that agree; it doubles with each halving of the photos."""
@@ -49,32 +56,42 @@ def make_depth_maps_on_cpu(task: DepthTask, steps: Steps = STEPS) -> list[Reject
     Both happen at every level; coarser levels fill gaps of finer ones. If the settings do not fix the number of levels,
     a coarser level follows if many pixels need it. Return for every view the reason why it has no maps, or None.
     """
-    everything, options = range(len(task.views)), task.options
-    inputs = _Inputs(halve_views(task.views, max(options.levels, 1)), task.ranked, options, task.store, steps)
-    rejected = task.map(Task(_match, Shared(inputs), 0), everything, "matching depths")
-    if options.levels == AS_NEEDED:
-        shares = task.map(Task(_open_share, Shared(inputs)), everything, "measuring gaps in depth maps")
-        known = [share for share in shares if share is not None]
-        if known and float(np.mean(known)) >= OPTIONS.most_open:
-            inputs = replace(inputs, levels=halve_views(task.views, 2))
+    everything, options, store = range(len(task.views)), task.options, task.store
+    inputs = _Inputs(halve_views(task.views, max(options.levels, 1)), task.ranked, options, store, steps)
     shared = Shared(inputs)
+    matched = task.map(Task(_match, shared, 0), everything, "matching depths")
+    confirmed = task.map(Task(_confirm, shared), everything, "confirming depths")
+    rejected = [other if one is None else one for one, other in zip(matched, confirmed, strict=True)]
+    if options.levels != 1:
+        inputs = close_skies(inputs, [index for index in everything if matched[index] is None], task.map)
+        shared = Shared(inputs)
     for level in range(1, len(inputs.levels)):
-        coarse = task.map(Task(_match, shared, level), everything, "matching depths in smaller photos")
-        rejected = [one and other for one, other in zip(rejected, coarse, strict=True)]
-    usable = np.array([reason is None for reason in rejected])
-    confirm = Task(_confirm, shared, usable)
-    confirmed = iter(task.map(confirm, [index for index in everything if usable[index]], "confirming depths"))
-    rejected = [next(confirmed) if reason is None else reason for reason in rejected]
+        task.map(Task(_match, shared, level), everything, "matching depths in smaller photos")
+    has_map = task.map(Task(_fill, shared), everything, "filling gaps in depth maps")
+    mapped = [index for index in everything if has_map[index]]
     if len(inputs.levels) > 1:
-        confirmed_views = [index for index in everything if rejected[index] is None]
-        task.map(Task(_propose, shared), confirmed_views, "fitting planes to plain areas")
-        task.map(Task(_fill_plain_areas, shared), confirmed_views, "filling plain areas")
-    return rejected
+        task.map(Task(_propose, shared), mapped, "fitting planes to plain areas")
+        task.map(Task(_fill_plain_areas, shared), mapped, "filling plain areas")
+    return [None if has_map[index] else rejected[index] for index in everything]
 
 
-def _open_share(inputs: Shared[_Inputs], index: int) -> float | None:
+def close_skies(inputs: _Inputs, matched: Sequence[int], spread: ParallelMap) -> _Inputs:
+    """Return the inputs with the possible skies of matched photos, and with a second level if many pixels need it."""
+    gaps = spread(Task(_find_gaps, Shared(inputs)), matched, "measuring gaps in depth maps")
+    areas = [gap.areas for gap in gaps]
+    closed = possible_skies(areas, compare_areas(areas, [inputs.levels[0][index] for index in matched], spread))
+    shares = [gap.open_share(sky) for gap, sky in zip(gaps, closed, strict=True)]
+    levels = inputs.levels
+    if inputs.options.levels == AS_NEEDED and shares and float(np.mean(shares)) >= OPTIONS.most_open:
+        levels = halve_views(levels[0], 2)
+    return replace(inputs, levels=levels, closed=dict(zip(matched, closed, strict=True)))
+
+
+def _find_gaps(inputs: Shared[_Inputs], index: int) -> "Gaps":
     view, store = inputs.value.levels[0][index], inputs.value.store
-    return open_share(store.photo(view), store.read_estimate(view)) if store.has(view, "photometric") else None
+    estimate = store.read_estimate(view)
+    has_map = store.has(view, "confirmed")
+    return find_gaps(store.photo(view), estimate, store.read_depth(view, "confirmed") if has_map else estimate.depth)
 
 
 def _match(inputs: Shared[_Inputs], level: int, index: int) -> Rejected | None:
@@ -94,27 +111,39 @@ def _match(inputs: Shared[_Inputs], level: int, index: int) -> Rejected | None:
     return None
 
 
-def _confirm(inputs: Shared[_Inputs], usable: BoolArray, index: int) -> Rejected | None:
-    """Keep the confirmed depths of a photo, and fill gaps from coarser levels."""
+def _confirm(inputs: Shared[_Inputs], index: int) -> Rejected | None:
+    """Keep the confirmed depths of a photo."""
     task = inputs.value
     view = task.levels[0][index]
-    if task.store.has(view, "geometric"):
+    if task.store.has(view, "confirmed"):
         return None
-    maps = _confirm_level(task, 0, usable, index)
-    for level in range(1, len(task.levels)):
-        coarse = _confirm_level(task, level, usable, index)
-        if not isinstance(coarse, Rejected):
-            fine = DepthMap.unknown(view) if isinstance(maps, Rejected) else maps
-            # at half the size, a possible sky looks like a plain wall
-            blank = blank_areas(task.store.photo(view), fine.depth).blank
-            maps = fill_from_coarse(fine, view, coarse, task.levels[level][index], near_pixels(blank, fine.depth.shape))
+    maps = _confirm_level(task, 0, index)
     if isinstance(maps, Rejected):
         return maps
-    task.store.write_maps(view, maps)
+    task.store.write_maps(view, maps, "confirmed")
     return None
 
 
-def _confirm_level(task: _Inputs, level: int, usable: BoolArray, index: int) -> DepthMap | Rejected:
+def _fill(inputs: Shared[_Inputs], index: int) -> bool:
+    """Fill the gaps of a photo from coarser levels; return whether it has any depth."""
+    task = inputs.value
+    view, store = task.levels[0][index], task.store
+    if store.has(view, "geometric"):
+        return True
+    maps = store.read_maps(view, "confirmed") if store.has(view, "confirmed") else None
+    for level in range(1, len(task.levels)):
+        coarse = _confirm_level(task, level, index)
+        if not isinstance(coarse, Rejected):
+            fine = maps or DepthMap.unknown(view)
+            # at half the size, a possible sky looks like a plain wall
+            closed = task.closed_pixels(index, fine.depth.shape)
+            maps = fill_from_coarse(fine, view, coarse, task.levels[level][index], closed)
+    if maps is not None:
+        store.write_maps(view, maps)
+    return maps is not None
+
+
+def _confirm_level(task: _Inputs, level: int, index: int) -> DepthMap | Rejected:
     views, store = task.levels[level], task.store
     view = views[index]
     if not store.has(view, "photometric"):
@@ -122,7 +151,7 @@ def _confirm_level(task: _Inputs, level: int, usable: BoolArray, index: int) -> 
     others = [
         (views[other], store.read_depth(views[other]))
         for other in task.ranked[index]
-        if usable[other] and store.has(views[other], "photometric")
+        if store.has(views[other], "photometric")
     ]
     estimate, photo = store.read_estimate(view), store.photo(view)
     try:
@@ -141,7 +170,7 @@ def _propose(inputs: Shared[_Inputs], index: int) -> None:
             proposed = task.steps.propose(depth, photo, task.tolerance(1))
         except FAILURES:  # plain areas stay open
             proposed = np.zeros_like(depth)
-        proposed[near_pixels(blank_areas(photo, depth).blank, depth.shape)] = 0
+        proposed[task.closed_pixels(index, depth.shape)] = 0
         store.write_proposal(view, proposed)
 
 
@@ -188,11 +217,23 @@ def halve_views(views: Sequence[View], levels: int) -> list[list[View]]:
     return [list(views), *([view.halve(level) for view in views] for level in range(1, levels))]
 
 
-def open_share(photo: GrayImage, estimate: DepthEstimate) -> float:
-    """Measure the share of a photo without a sure depth that is neither black nor near a possible sky."""
-    sure = estimate.confidence >= DEPTH_OPTIONS.weak_correlation
-    blank = blank_areas(photo, np.where(sure, estimate.depth, np.float32(0))).blank
-    return float(np.mean(~sure & (photo >= OPTIONS.black) & ~near_pixels(blank, photo.shape)))
+@dataclass(frozen=True, slots=True, eq=False)
+class Gaps:
+    """Where a photo has no sure depth."""
+
+    areas: PhotoAreas
+    open: NDArray[np.float32]
+    """(h, w) share of the pixels of each cell that have no sure depth and are not black."""
+
+    def open_share(self, closed: BoolArray) -> float:
+        """Return the share of the photo that is open beyond and beside closed cells (h, w)."""
+        return float(np.mean(np.where(near_pixels(closed, closed.shape), 0, self.open)))
+
+
+def find_gaps(photo: GrayImage, estimate: DepthEstimate, confirmed: DepthArray) -> Gaps:
+    """Find the blank areas of a photo (H, W) without confirmed depths (H, W), and everything without a sure depth."""
+    unsure = estimate.confidence < DEPTH_OPTIONS.weak_correlation
+    return Gaps(blank_areas(photo, confirmed), to_cells((unsure & (photo >= OPTIONS.black)).astype(np.float32)))
 
 
 def fill_from_coarse(fine: DepthMap, view: View, coarse: DepthMap, small: View, closed: BoolArray) -> DepthMap:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sfm_app.numerical import local_deviation
 from sfm_app.stereo.view import GrayImage, View
+from sfm_app.tasks import ParallelMap, Shared, Task
 from sfm_app.types.arrays import BoolArray, DepthArray, FloatArray, IndexArray
 
 
@@ -80,8 +81,8 @@ class PhotoAreas:
 def blank_areas(photo: GrayImage, depth: DepthArray) -> PhotoAreas:
     """Find the bright and even areas of a photo with hardly any depths."""
     variation = local_deviation(photo, OPTIONS.window_px)
-    cells, known = _to_cells(photo.astype(np.float32)), _to_cells((depth > 0).astype(np.float32))
-    blank = (known < OPTIONS.open_share) & (_to_cells(variation) <= OPTIONS.most_variation)
+    cells, known = to_cells(photo.astype(np.float32)), to_cells((depth > 0).astype(np.float32))
+    blank = (known < OPTIONS.open_share) & (to_cells(variation) <= OPTIONS.most_variation)
     labels = cv2.connectedComponents(blank.view(np.uint8), connectivity=4)[1]
     surfaces = known >= OPTIONS.known_share
     levels, mean_gray = np.sort(cells[surfaces]), _mean_gray(labels, cells)
@@ -99,7 +100,7 @@ def _mean_gray(labels: NDArray[np.signedinteger], gray: NDArray[np.float32]) -> 
     return np.asarray(np.bincount(labels.ravel(), gray.ravel()) / np.maximum(np.bincount(labels.ravel()), 1))
 
 
-def _to_cells(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def to_cells(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return (h, w) the means over cells of values (H, W)."""
     height, width = values.shape
     scale = min(1.0, OPTIONS.longer_side / max(height, width))
@@ -124,6 +125,15 @@ def spread_partners(views: Sequence[View], index: int) -> list[int]:
     if len(partners) > OPTIONS.partners:
         partners = partners[np.linspace(0, len(partners) - 1, OPTIONS.partners).round().astype(np.int64)]
     return partners.tolist()
+
+
+def compare_areas(areas: Sequence[PhotoAreas], views: Sequence[View], spread: ParallelMap) -> list[FloatArray]:
+    """Return for each photo the votes (3, A) of the others about its blank areas; see `count_votes`."""
+    return spread(Task(_count_votes, Shared((areas, views))), range(len(views)), "comparing blank areas")
+
+
+def _count_votes(photos: Shared[tuple[Sequence[PhotoAreas], Sequence[View]]], index: int) -> FloatArray:
+    return count_votes(*photos.value, index)
 
 
 def count_votes(areas: Sequence[PhotoAreas], views: Sequence[View], index: int) -> FloatArray:
@@ -155,13 +165,40 @@ def _find_cells(
 
 def find_skies(areas: Sequence[PhotoAreas], votes: Sequence[FloatArray]) -> list[BoolArray]:
     """Return the sky cells (h, w) of each photo; none if the votes do not show that the scene has a sky."""
-    large = [one.at_border & (one.size >= OPTIONS.least_share * one.labels.size) for one in areas]
-    counts = sum((vote[:, own].sum(axis=1) for vote, own in zip(votes, large, strict=True)), np.zeros(3))
     # a sky needs agreement among the votes, and votes from enough views
-    blank, other, nearer = counts
-    if not blank or blank < OPTIONS.agreeing * (blank + other) or blank < OPTIONS.visible * (blank + other + nearer):
+    large, (blank, other, nearer) = _count_large(areas, votes)
+    if not _agree(blank, other) or blank < OPTIONS.visible * (blank + other + nearer):
         return [np.zeros(one.labels.shape, bool) for one in areas]
     return [_sky_of(*one) for one in zip(areas, votes, large, strict=True)]
+
+
+def possible_skies(areas: Sequence[PhotoAreas], votes: Sequence[FloatArray]) -> list[BoolArray]:
+    """Return the cells (h, w) of each photo that may be sky: blank ones that the votes do not show to be walls."""
+    _, (blank, other, _) = _count_large(areas, votes)
+    if _agree(blank, other):
+        return [one.blank for one in areas]
+    found = []
+    for one, vote in zip(areas, votes, strict=True):
+        may = vote[0] >= OPTIONS.least_visible * vote.sum(axis=0)  # also where no photo has a vote
+        may[0] = False
+        found.append(np.asarray(may[one.labels]))
+    return found
+
+
+def _count_large(
+    areas: Sequence[PhotoAreas], votes: Sequence[FloatArray]
+) -> tuple[list[BoolArray], tuple[float, float, float]]:
+    """Return the large areas (A,) of each photo at its border, and the sums of the three kinds of votes about these."""
+    large = [one.at_border & (one.size >= OPTIONS.least_share * one.labels.size) for one in areas]
+    blank, other, nearer = sum(
+        (vote[:, own].sum(axis=1) for vote, own in zip(votes, large, strict=True)), np.zeros(3)
+    ).tolist()
+    return large, (blank, other, nearer)
+
+
+def _agree(blank: float, other: float) -> bool:
+    """Return whether photos show blank areas in the same directions, as those of a sky do."""
+    return blank > 0 and blank >= OPTIONS.agreeing * (blank + other)
 
 
 def _sky_of(areas: PhotoAreas, votes: FloatArray, large: BoolArray) -> BoolArray:

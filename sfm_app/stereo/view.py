@@ -16,7 +16,7 @@ from sfm_app.types.arrays import DepthArray, FloatArray, IndexArray
 
 GrayImage = NDArray[np.uint8]
 """(H, W)."""
-Kind = Literal["photometric", "geometric", "proposed", "final"]
+Kind = Literal["photometric", "confirmed", "proposed", "geometric", "final"]
 """COLMAP's names for a depth map before and after the check against the other photos; proposals for plain areas; and
 maps with sharp outlines before they replace the geometric ones."""
 
@@ -77,7 +77,7 @@ class DepthEstimate:
 class DepthStore(Protocol):
     """Reads photos and keeps maps; a map appears complete or not at all.
 
-    Estimates are photometric, maps are geometric; a proposal has depths in plain areas, 0 elsewhere.
+    Estimates are photometric, maps confirmed, then geometric; a proposal has depths in plain areas, 0 elsewhere.
     """
 
     def photo(self, view: View, /) -> GrayImage:
@@ -86,9 +86,9 @@ class DepthStore(Protocol):
     def has(self, view: View, kind: Kind, /) -> bool: ...
     def read_estimate(self, view: View, /) -> DepthEstimate: ...
     def read_depth(self, view: View, kind: Kind = "photometric", /) -> DepthArray: ...
-    def read_maps(self, view: View, /) -> DepthMap: ...
+    def read_maps(self, view: View, kind: Kind = "geometric", /) -> DepthMap: ...
     def write_estimate(self, view: View, estimate: DepthEstimate, /) -> None: ...
-    def write_maps(self, view: View, maps: DepthMap, /) -> None: ...
+    def write_maps(self, view: View, maps: DepthMap, kind: Kind = "geometric", /) -> None: ...
     def write_proposal(self, view: View, depth: DepthArray, /) -> None: ...
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.dense import read_depth
 from sfm_app.colmap.surface import positions
+from sfm_app.geometry.raster import NOTHING, rasterize
 from sfm_app.geometry.triangles import select_faces, unique_edges
 from sfm_app.meshing.cleaning import make_manifold
 from sfm_app.meshing.refinement import finest_pixels
@@ -30,6 +31,8 @@ LEAST_LOOKED = 0.4
 behind the pediment of fountain-P11 has 0.44."""
 MOST_AGAINST = 0.3
 """Largest share of a patch that photos see through. Chosen on fountain-P11: at half, more pixels are off."""
+HALVED = 2
+"""Halvings of the photos in which backs of triangles are counted. Chosen by hand."""
 SMOOTHING = 3
 """Steps of smoothing: the cut passes through points with noise. Chosen by hand."""
 LEAST_CONFIRMED = 200
@@ -101,7 +104,7 @@ def drop_guesses(surface: Surface, step: FloatArray, evidence: Evidence) -> Surf
     """Drop triangles that are longer than the gaps of points, except patches over holes that photos do not contradict.
 
     `step` (V,) is the distance of the points at each vertex. Measured triangles surround such a patch, and hardly any
-    photo sees through it; it is narrow, or photos look at a part of it and not along it.
+    photo sees through it. It is narrow, or photos look at a part of it and not along it, or see insides without it.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -132,7 +135,8 @@ def drop_guesses(surface: Surface, step: FloatArray, evidence: Evidence) -> Surf
     keep = np.ones(len(surface.faces), np.bool_)
     looked = sum_up(size * (facing > 0.0))
     is_faced = (looked >= LEAST_LOOKED * area) & (sum_up(size * facing) >= LEAST_FACING * looked)
-    keep[guesses] = (is_whole & (is_narrow | is_faced))[patch]
+    hides = _count_backs(surface, guesses, patch, evidence) > 0
+    keep[guesses] = (is_whole & (is_narrow | is_faced | hides))[patch]
     return select_faces(surface, keep)
 
 
@@ -150,6 +154,28 @@ def _ask_photos(points: FloatArray, normals: FloatArray, evidence: Evidence) -> 
         looks += agrees
         looks -= verdict == SEEN_THROUGH
     return facing, looks < 0
+
+
+def _count_backs(
+    surface: Surface, guesses: IndexArray, patch: NDArray[np.signedinteger], evidence: Evidence
+) -> IndexArray:
+    """Return how many more backs than fronts of triangles photos would see through each patch, in pixels.
+
+    No photo can see the inside of a body. `patch` has the number of the patch of each guess.
+    """
+    measured, count = np.delete(surface.faces, guesses, axis=0), int(patch.max(initial=-1)) + 1
+
+    def look(number: int) -> IndexArray:
+        view = evidence.views[number].halve(HALVED)
+        before, behind = (rasterize(surface.vertices, some, view) for some in (surface.faces[guesses], measured))
+        hit = (before.face != NOTHING) & (before.depth < behind.depth) & np.isfinite(behind.depth)
+        number_of, is_back = patch[before.face[hit]], behind.face[hit] == NOTHING
+        return np.bincount(number_of[is_back], minlength=count) - np.bincount(number_of[~is_back], minlength=count)
+
+    more = np.zeros(count, np.int64)
+    for one in evidence.spread(look, range(len(evidence.views))):
+        more += one
+    return more
 
 
 def smooth(surface: Surface) -> Surface:

@@ -17,7 +17,7 @@ from sfm_app.stereo import (
     method,
     rank_neighbors,
 )
-from sfm_app.stereo.method import Steps, fill_from_coarse, halve_views, open_share
+from sfm_app.stereo.method import Steps, fill_from_coarse, find_gaps, halve_views
 from sfm_app.stereo.patch_match import fit_planes, plane_normals
 from sfm_app.types import Rejected
 
@@ -29,7 +29,7 @@ class Memory:
     """A store in memory; a write beyond the `full`-th kills the run."""
 
     plane: object
-    maps: dict = field(default_factory=lambda: {"photometric": {}, "geometric": {}, "proposed": {}})
+    maps: dict = field(default_factory=lambda: {"photometric": {}, "confirmed": {}, "geometric": {}, "proposed": {}})
     written: list = field(default_factory=list)
     full: int = 100
 
@@ -51,8 +51,8 @@ class Memory:
     def read_estimate(self, view):
         return self.read(view, "photometric")
 
-    def read_maps(self, view):
-        return self.read(view, "geometric")
+    def read_maps(self, view, kind="geometric"):
+        return self.read(view, kind)
 
     def read_depth(self, view, kind="photometric"):
         return self.read(view, kind) if kind == "proposed" else self.read(view, kind).depth
@@ -60,8 +60,8 @@ class Memory:
     def write_estimate(self, view, estimate):
         self.write(view, "photometric", estimate)
 
-    def write_maps(self, view, maps):
-        self.write(view, "geometric", maps)
+    def write_maps(self, view, maps, kind="geometric"):
+        self.write(view, kind, maps)
 
     def write_proposal(self, view, depth):
         self.write(view, "proposed", depth)
@@ -90,14 +90,17 @@ class Banded(Memory):
         return gray
 
 
+@dataclass
 class Door(Memory):
     """Photos of a plane with a plain door in the middle."""
+
+    gray: int = 90
 
     def photo(self, view):
         rays = self.plane._rays(view, 0.5)
         points = view.center + self.plane.depth(replace(view, sample_px=0.5))[..., None] * rays
         door = (np.abs(points[..., 0]) < 0.6) & (np.abs(points[..., 1]) < 0.5)
-        return np.where(door, 90, self.plane.photo(view)).astype(np.uint8)
+        return np.where(door, self.gray, self.plane.photo(view).clip(0, 200)).astype(np.uint8)
 
 
 @pytest.fixture
@@ -143,12 +146,12 @@ def test_a_killed_run_resumes_at_the_same_photo(plane, small_views):
     killed.full = 100
     assert make_depth_maps_on_cpu(task_of(small_views, killed, neighbors=2)) == [None, None, None]
 
-    assert killed.written == ["0.jpg", "1.jpg", "2.jpg", "0.jpg", "1.jpg", "2.jpg"]
+    assert killed.written == 3 * ["0.jpg", "1.jpg", "2.jpg"]
     for name, maps in whole.maps["geometric"].items():
         assert maps.depth.tobytes() == killed.maps["geometric"][name].depth.tobytes()
         assert np.mean(maps.depth > 0) > 0.3
     make_depth_maps_on_cpu(task_of(small_views, killed, neighbors=2))
-    assert len(killed.written) == 6
+    assert len(killed.written) == 9
 
 
 @pytest.mark.slow
@@ -284,8 +287,12 @@ def test_black_pixels_and_a_possible_sky_are_no_gaps(plane, make_view):
     known[:, :60] = known[:, 180:] = False
     estimate = DepthEstimate(np.where(known, depth, np.float32(0)), known.astype(np.float32))
 
-    assert open_share(photo, estimate) == pytest.approx(0.25, abs=0.02)  # the dark band, not the bright one
-    assert open_share(np.where(photo == 50, 10, photo).astype(np.uint8), estimate) < 0.02
+    gaps = find_gaps(photo, estimate, estimate.depth)
+    black = find_gaps(np.where(photo == 50, 10, photo).astype(np.uint8), estimate, estimate.depth)
+
+    assert gaps.open_share(gaps.areas.blank) == pytest.approx(0.25, abs=0.02)  # the dark band, not the bright one
+    assert black.open_share(black.areas.blank) < 0.02
+    assert gaps.open_share(np.zeros_like(gaps.areas.blank)) == pytest.approx(0.5, abs=0.02)  # a wall is a gap
 
 
 def test_a_failed_plane_fit_keeps_the_depths(plane, near_views):
@@ -325,3 +332,19 @@ def test_a_door_with_only_its_frame_known_is_closed(plane, near_views, levels):
     for name, (depth, normals) in before.items():
         np.testing.assert_array_equal(final[name].depth, depth)
         np.testing.assert_array_equal(final[name].normals, normals)
+
+
+@pytest.mark.parametrize(("apart", "closed"), [(0.5, False), (2.5, True)])
+def test_a_bright_door_is_closed_if_other_photos_show_no_sky_in_its_direction(plane, make_view, apart, closed):
+    views = [make_view(apart * np.array(center), name=f"{k}.jpg") for k, center in enumerate(CENTERS)]
+    store = Door(plane, gray=240)
+
+    def confirm(view, photo, *_):
+        return maps_of(np.where(photo != 240, plane.depth(view), np.float32(0)), view)
+
+    assert make_depth_maps_on_cpu(task_of(views, store, 2), true_steps(plane, confirm)) == [None] * 5
+
+    for view in views:
+        inside = cv2.erode((store.photo(view) == 240).view(np.uint8), np.ones((9, 9))) > 0
+        assert inside.any()
+        assert np.mean(store.maps["geometric"][view.name, 0].depth[inside] > 0) == pytest.approx(float(closed), abs=0.1)

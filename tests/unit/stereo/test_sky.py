@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sfm_app.stereo import View
-from sfm_app.stereo.sky import blank_areas, count_votes, find_skies, sky_pixels, spread_partners
+from sfm_app.stereo.sky import blank_areas, count_votes, find_skies, possible_skies, sky_pixels, spread_partners
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 500.0
 SIDEWAYS = np.linspace(-2.0, 2.0, 6)
@@ -49,20 +49,29 @@ def sky(x, ray):
     return np.full(ray.shape[1:], np.inf)
 
 
-def plain_wall(x, ray):
+def plain_wall(x, ray, width=3.0):
     """A wall 8 away, textured but for a part."""
-    at = x + 8.0 * ray[0]
-    return np.where((at > -1.5) & (at < 1.5), np.inf, 8.0)
+    return np.where(np.abs(x + 8.0 * ray[0]) < 0.5 * width, np.inf, 8.0)
+
+
+def plain_panel(x, ray):
+    """The same with a part that moves by its width from photo to photo."""
+    return plain_wall(x, ray, width=0.8)
 
 
 def photograph_all(gray_of_blank, backdrop=sky):
     return [photograph(x, gray_of_blank, backdrop) for x in SIDEWAYS]
 
 
-def skies_of(photos):
+def areas_of(photos):
+    """Return the blank areas of all photos, and the votes about them."""
     areas = [blank_areas(photo.gray, photo.depth) for photo in photos]
     views = [photo.view for photo in photos]
-    cells = find_skies(areas, [count_votes(areas, views, index) for index in range(len(views))])
+    return areas, [count_votes(areas, views, index) for index in range(len(views))]
+
+
+def skies_of(photos):
+    cells = find_skies(*areas_of(photos))
     return [sky_pixels(photo.gray, own) for photo, own in zip(photos, cells, strict=True)]
 
 
@@ -127,6 +136,22 @@ def test_a_wall_stays_in_a_scene_with_a_sky():
     for (photo, window), own in zip(walled, found, strict=True):
         assert own[photo.blank].mean() > 0.98
         assert own[window].mean() < 0.05
+
+
+@pytest.mark.parametrize(("backdrop", "possible"), [(sky, True), (plain_panel, False)])
+def test_a_sky_is_possible_where_other_photos_show_nothing_in_that_direction(backdrop, possible):
+    areas, votes = areas_of(photograph_all(220.0, backdrop))
+
+    for one, found in zip(areas, possible_skies(areas, votes), strict=True):
+        assert one.blank.mean() > 0.01
+        assert found[one.blank].mean() == pytest.approx(float(possible), abs=0.05)
+        assert not found[~one.blank].any()
+
+
+def test_a_blank_area_that_no_other_photo_shows_may_be_the_sky():
+    areas, votes = areas_of([photograph(0.0, 220.0, sky)])
+
+    np.testing.assert_array_equal(possible_skies(areas, votes)[0], areas[0].blank)
 
 
 def test_one_photo_does_not_vote_about_itself():

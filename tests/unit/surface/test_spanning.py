@@ -251,3 +251,69 @@ def test_smoothing_takes_noise_away_and_keeps_the_border_in_place():
     np.testing.assert_allclose(found.vertices[edge & middle], rough.vertices[edge & middle], atol=1e-9)
     np.testing.assert_array_equal(found.faces, rough.faces)
     np.testing.assert_array_equal(found.colors, rough.colors)
+
+
+SIDES = [
+    (np.array(out), np.array(along))
+    for out, along in (((1, 0), (0, 1)), ((0, 1), (-1, 0)), ((-1, 0), (0, -1)), ((0, -1), (1, 0)))
+]
+"""Directions out of the four sides of a box, and along them."""
+
+
+def box_cloud(height, inward, ground=1.0):
+    """Points on the sides of a box from -1 to 1 and of a height, with normals to its outside or its inside.
+
+    Those of its ground are at least `ground` from its middle.
+    """
+    ticks = [np.linspace(low, high, round((high - low) / STEP) + 1) for low, high in ((-1, 1), (-1, 1), (0, height))]
+    along, up = grid(*ticks[1:])[0].T
+    points, normals = [], []
+    for out, side in SIDES:
+        points.append(np.column_stack([out + along[:, None] * side, up]))
+        normals.append(np.tile([*(-out if inward else out), 0.0], (len(up), 1)))
+    flat = grid(*ticks[:2])[0]
+    flat = flat[np.abs(flat).max(axis=1) > ground]
+    points.append(np.column_stack([flat, np.zeros(len(flat))]))
+    normals.append(np.tile([0.0, 0.0, 1.0], (len(flat), 1)))
+    at = np.concatenate(points)
+    at += 0.1 * STEP * np.random.default_rng(0).normal(size=at.shape)
+    return Cloud(at, np.concatenate(normals), np.zeros((len(at), 3), np.uint8), np.full(len(at), STEP))
+
+
+def box_depths(view, height, ground=1.0):
+    """Depths (H, W) of the box, seen from inside or outside; 0 on its top, its unknown ground, and beside it."""
+    pixels = np.stack(np.meshgrid(*[np.arange(WIDTH) + view.sample_px] * 2), axis=-1)
+    rays = view.rays(pixels) @ view.R
+    with np.errstate(divide="ignore"):
+        ends = (np.array([[-1, -1, 0], [1, 1, height]])[:, None, None] - view.center) / rays
+    enter, leave = ends.min(axis=0), ends.max(axis=0)
+    inside = np.abs(view.center[:2]).max() < 1.0
+    axis = np.argmin(leave, axis=-1) if inside else np.argmax(enter, axis=-1)
+    depth = np.take_along_axis(leave if inside else enter, axis[..., None], axis=-1)[..., 0]
+    place = view.center + rays * depth[..., None]
+    known = (axis < 2) | ((place[..., 2] < 0.1) & (np.abs(place[..., :2]).max(axis=-1) > ground))
+    return np.where(known & (enter.max(axis=-1) <= leave.min(axis=-1)), depth, 0.0).astype(np.float32)
+
+
+def around(distance, height, target):
+    return [view_at(f"{k}.png", (distance * np.cos(k), distance * np.sin(k), height), target) for k in range(6)]
+
+
+def test_the_unknown_ground_of_a_court_is_closed(seen):
+    views = [
+        view_at(f"{k}.png", (0.6 * np.cos(k), 0.6 * np.sin(k), 0.4), (-9 * np.cos(k), -9 * np.sin(k), 0.3))
+        for k in range(12)
+    ]
+
+    found, _ = seen(box_cloud(0.6, True, ground=0.96), views, lambda view: box_depths(view, 0.6, ground=0.97))
+
+    assert total(found) == pytest.approx(4 * 2 * 0.6 + 4.0, rel=0.08)
+
+
+def test_no_photo_sees_the_inside_of_a_body(seen):
+    """Photos at a low angle show no depth on a plain top; without it they would show the backs of the sides."""
+    views = around(5.0, 1.8, (0.0, 0.0, 0.5))
+
+    found, _ = seen(box_cloud(1.0, False), views, lambda view: box_depths(view, 1.0))
+
+    assert total(found) == pytest.approx(4 * 2.0 + 4.0, rel=0.05)
