@@ -33,6 +33,8 @@ class SkyOptions:
     """Most photos that vote about a photo. Chosen by hand."""
     agreeing: float = 0.85
     """Share of agreeing votes in a scene with a sky. Four sets with a sky have 0.90 or more, others 0.75 or less."""
+    doubtful: float = 0.67
+    """The same share from which a scene may have a sky. Rendered houses before a sky have 0.75 to 0.81."""
     visible: float = 0.4
     """The same share with occluded views included. Sets with a sky have 0.53 or more, others 0.43 or less."""
     least_visible: float = 0.3
@@ -167,7 +169,7 @@ def find_skies(areas: Sequence[PhotoAreas], votes: Sequence[FloatArray]) -> list
     """Return the sky cells (h, w) of each photo; none if the votes do not show that the scene has a sky."""
     # a sky needs agreement among the votes, and votes from enough views
     large, (blank, other, nearer) = _count_large(areas, votes)
-    if not _agree(blank, other) or blank < OPTIONS.visible * (blank + other + nearer):
+    if not blank or blank < OPTIONS.agreeing * (blank + other) or blank < OPTIONS.visible * (blank + other + nearer):
         return [np.zeros(one.labels.shape, bool) for one in areas]
     return [_sky_of(*one) for one in zip(areas, votes, large, strict=True)]
 
@@ -175,7 +177,7 @@ def find_skies(areas: Sequence[PhotoAreas], votes: Sequence[FloatArray]) -> list
 def possible_skies(areas: Sequence[PhotoAreas], votes: Sequence[FloatArray]) -> list[BoolArray]:
     """Return the cells (h, w) of each photo that may be sky: blank ones that the votes do not show to be walls."""
     _, (blank, other, _) = _count_large(areas, votes)
-    if _agree(blank, other):
+    if blank and blank >= OPTIONS.doubtful * (blank + other):
         return [one.blank for one in areas]
     found = []
     for one, vote in zip(areas, votes, strict=True):
@@ -194,11 +196,6 @@ def _count_large(
         (vote[:, own].sum(axis=1) for vote, own in zip(votes, large, strict=True)), np.zeros(3)
     ).tolist()
     return large, (blank, other, nearer)
-
-
-def _agree(blank: float, other: float) -> bool:
-    """Return whether photos show blank areas in the same directions, as those of a sky do."""
-    return blank > 0 and blank >= OPTIONS.agreeing * (blank + other)
 
 
 def _sky_of(areas: PhotoAreas, votes: FloatArray, large: BoolArray) -> BoolArray:
