@@ -150,19 +150,19 @@ class DenseStore:
         """Read the depths of a map of a view."""
         return read_depth(self.dense_dir, view, kind)
 
-    def read_maps(self, view: View, kind: Kind = "geometric") -> DepthMap:
-        """Read the maps of a view."""
+    def read_maps(self, view: View) -> DepthMap:
+        """Read the geometric maps of a view."""
         with translate_errors(f"reading the normal map of {view.name}"):
             stored = pycolmap.NormalMap()
-            stored.read(_map_path(self.dense_dir, NORMALS, view, kind))
+            stored.read(normals_file(self.dense_dir, view))
         planes = np.array(stored.to_array(), np.float32)
         height, width = planes.shape[:2]
         normals = np.ascontiguousarray(planes.reshape(3, height, width).transpose(1, 2, 0))
-        return DepthMap(self.read_depth(view, kind), normals)
+        return DepthMap(self.read_depth(view, "geometric"), normals)
 
-    def write_proposal(self, view: View, depth: Float32Array) -> None:
-        """Write proposed depths (H, W) of the plain areas of a view, 0 where unknown."""
-        _write_depth_format(self.dense_dir, DEPTHS, view, depth, "proposed")
+    def write_depth(self, view: View, depth: Float32Array, kind: Kind) -> None:
+        """Write depths (H, W) of a view, 0 where unknown, without normals."""
+        _write_depth_format(self.dense_dir, DEPTHS, view, depth, kind)
 
     def write_estimate(self, view: View, estimate: DepthEstimate) -> None:
         """Write the photometric map of a view, without depth where the photo is masked."""
@@ -211,11 +211,10 @@ def publish_maps(dense_dir: Path, view: View) -> None:
 
 
 def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:
-    """Remove the photometric and confirmed maps and the proposals of all views."""
+    """Remove the photometric and closed maps and the proposals of all views."""
     for view in views:
         _map_path(dense_dir, DEPTHS, view, "proposed").unlink(missing_ok=True)
-        for folder in (DEPTHS, NORMALS):
-            _map_path(dense_dir, folder, view, "confirmed").unlink(missing_ok=True)
+        _map_path(dense_dir, DEPTHS, view, "closed").unlink(missing_ok=True)
         for scaled in (view, *(view.halve(level) for level in range(1, MOST_LEVELS))):
             for folder in (DEPTHS, NORMALS, CONFIDENCES):
                 _map_path(dense_dir, folder, scaled, "photometric").unlink(missing_ok=True)

@@ -1,7 +1,7 @@
 """The depth-map method for every machine."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,12 +38,11 @@ class _Inputs:
     options: DepthSettings
     store: DepthStore
     steps: Steps
-    closed: Mapping[int, BoolArray] = field(default_factory=dict[int, BoolArray])
-    """Cells of possible skies, by the number of the photo: they are not filled."""
 
-    def closed_pixels(self, index: int, shape: tuple[int, ...]) -> BoolArray:
-        """Mark the pixels of a photo of a shape (H, W) that are not filled."""
-        return near_pixels(self.closed.get(index, np.zeros((1, 1), np.bool_)), shape)
+    def closed_pixels(self, view: View) -> BoolArray:
+        """Mark the pixels (H, W) of a photo that are not filled."""
+        closed = self.store.read_depth(view, "closed") if self.store.has(view, "closed") else np.zeros((1, 1))
+        return near_pixels(closed > 0, (view.height, view.width))
 
     def tolerance(self, level: int) -> float:
         """Return the relative difference of depths that agree; it doubles with each halving of the photos."""
@@ -67,7 +66,9 @@ def make_depth_maps_on_cpu(task: DepthTask, steps: Steps = STEPS) -> list[Reject
         shared = Shared(inputs)
     for level in range(1, len(inputs.levels)):
         task.map(Task(_match, shared, level), everything, "matching depths in smaller photos")
-    has_map = task.map(Task(_fill, shared), everything, "filling gaps in depth maps")
+    if len(inputs.levels) > 1:
+        task.map(Task(_fill, shared), everything, "filling gaps in depth maps")
+    has_map = [store.has(view, "geometric") for view in task.views]
     mapped = [index for index in everything if has_map[index]]
     if len(inputs.levels) > 1:
         task.map(Task(_propose, shared), mapped, "fitting planes to plain areas")
@@ -76,22 +77,24 @@ def make_depth_maps_on_cpu(task: DepthTask, steps: Steps = STEPS) -> list[Reject
 
 
 def close_skies(inputs: _Inputs, matched: Sequence[int], spread: ParallelMap) -> _Inputs:
-    """Return the inputs with the possible skies of matched photos, and with a second level if many pixels need it."""
+    """Close the possible skies of matched photos, unless a killed run has; add a level if many pixels need it."""
+    views, store = [inputs.levels[0][index] for index in matched], inputs.store
     gaps = spread(Task(_find_gaps, Shared(inputs)), matched, "measuring gaps in depth maps")
-    areas = [gap.areas for gap in gaps]
-    closed = possible_skies(areas, compare_areas(areas, [inputs.levels[0][index] for index in matched], spread))
-    shares = [gap.open_share(sky) for gap, sky in zip(gaps, closed, strict=True)]
-    levels = inputs.levels
+    if not all(store.has(view, "closed") for view in views):
+        areas = [gap.areas for gap in gaps]
+        for view, cells in zip(views, possible_skies(areas, compare_areas(areas, views, spread)), strict=True):
+            store.write_depth(view, cells.astype(np.float32), "closed")
+    shares = [gap.open_share(store.read_depth(view, "closed") > 0) for gap, view in zip(gaps, views, strict=True)]
     if inputs.options.levels == AS_NEEDED and shares and float(np.mean(shares)) >= OPTIONS.most_open:
-        levels = halve_views(levels[0], 2)
-    return replace(inputs, levels=levels, closed=dict(zip(matched, closed, strict=True)))
+        return replace(inputs, levels=halve_views(inputs.levels[0], 2))
+    return inputs
 
 
 def _find_gaps(inputs: Shared[_Inputs], index: int) -> "Gaps":
     view, store = inputs.value.levels[0][index], inputs.value.store
     estimate = store.read_estimate(view)
-    has_map = store.has(view, "confirmed")
-    return find_gaps(store.photo(view), estimate, store.read_depth(view, "confirmed") if has_map else estimate.depth)
+    has_map = store.has(view, "geometric")
+    return find_gaps(store.photo(view), estimate, store.read_depth(view, "geometric") if has_map else estimate.depth)
 
 
 def _match(inputs: Shared[_Inputs], level: int, index: int) -> Rejected | None:
@@ -115,32 +118,28 @@ def _confirm(inputs: Shared[_Inputs], index: int) -> Rejected | None:
     """Keep the confirmed depths of a photo."""
     task = inputs.value
     view = task.levels[0][index]
-    if task.store.has(view, "confirmed"):
+    if task.store.has(view, "geometric"):
         return None
     maps = _confirm_level(task, 0, index)
     if isinstance(maps, Rejected):
         return maps
-    task.store.write_maps(view, maps, "confirmed")
+    task.store.write_maps(view, maps)
     return None
 
 
-def _fill(inputs: Shared[_Inputs], index: int) -> bool:
-    """Fill the gaps of a photo from coarser levels; return whether it has any depth."""
+def _fill(inputs: Shared[_Inputs], index: int) -> None:
+    """Fill the gaps of a photo from coarser levels; a repetition changes nothing."""
     task = inputs.value
     view, store = task.levels[0][index], task.store
-    if store.has(view, "geometric"):
-        return True
-    maps = store.read_maps(view, "confirmed") if store.has(view, "confirmed") else None
+    maps = store.read_maps(view) if store.has(view, "geometric") else None
     for level in range(1, len(task.levels)):
         coarse = _confirm_level(task, level, index)
         if not isinstance(coarse, Rejected):
-            fine = maps or DepthMap.unknown(view)
             # at half the size, a possible sky looks like a plain wall
-            closed = task.closed_pixels(index, fine.depth.shape)
+            closed, fine = task.closed_pixels(view), maps or DepthMap.unknown(view)
             maps = fill_from_coarse(fine, view, coarse, task.levels[level][index], closed)
     if maps is not None:
         store.write_maps(view, maps)
-    return maps is not None
 
 
 def _confirm_level(task: _Inputs, level: int, index: int) -> DepthMap | Rejected:
@@ -170,8 +169,8 @@ def _propose(inputs: Shared[_Inputs], index: int) -> None:
             proposed = task.steps.propose(depth, photo, task.tolerance(1))
         except FAILURES:  # plain areas stay open
             proposed = np.zeros_like(depth)
-        proposed[task.closed_pixels(index, depth.shape)] = 0
-        store.write_proposal(view, proposed)
+        proposed[task.closed_pixels(view)] = 0
+        store.write_depth(view, proposed, "proposed")
 
 
 def _fill_plain_areas(inputs: Shared[_Inputs], index: int) -> None:

@@ -29,7 +29,7 @@ class Memory:
     """A store in memory; a write beyond the `full`-th kills the run."""
 
     plane: object
-    maps: dict = field(default_factory=lambda: {"photometric": {}, "confirmed": {}, "geometric": {}, "proposed": {}})
+    maps: dict = field(default_factory=lambda: {"photometric": {}, "geometric": {}, "closed": {}, "proposed": {}})
     written: list = field(default_factory=list)
     full: int = 100
 
@@ -51,20 +51,21 @@ class Memory:
     def read_estimate(self, view):
         return self.read(view, "photometric")
 
-    def read_maps(self, view, kind="geometric"):
-        return self.read(view, kind)
+    def read_maps(self, view):
+        return self.read(view, "geometric")
 
     def read_depth(self, view, kind="photometric"):
-        return self.read(view, kind) if kind == "proposed" else self.read(view, kind).depth
+        found = self.read(view, kind)
+        return found if kind in ("closed", "proposed") else found.depth
 
     def write_estimate(self, view, estimate):
         self.write(view, "photometric", estimate)
 
-    def write_maps(self, view, maps, kind="geometric"):
-        self.write(view, kind, maps)
+    def write_maps(self, view, maps):
+        self.write(view, "geometric", maps)
 
-    def write_proposal(self, view, depth):
-        self.write(view, "proposed", depth)
+    def write_depth(self, view, depth, kind):
+        self.write(view, kind, depth)
 
 
 @dataclass
@@ -146,12 +147,12 @@ def test_a_killed_run_resumes_at_the_same_photo(plane, small_views):
     killed.full = 100
     assert make_depth_maps_on_cpu(task_of(small_views, killed, neighbors=2)) == [None, None, None]
 
-    assert killed.written == 3 * ["0.jpg", "1.jpg", "2.jpg"]
+    assert killed.written == ["0.jpg", "1.jpg", "2.jpg", "0.jpg", "1.jpg", "2.jpg"]
     for name, maps in whole.maps["geometric"].items():
         assert maps.depth.tobytes() == killed.maps["geometric"][name].depth.tobytes()
         assert np.mean(maps.depth > 0) > 0.3
     make_depth_maps_on_cpu(task_of(small_views, killed, neighbors=2))
-    assert len(killed.written) == 9
+    assert len(killed.written) == 6
 
 
 @pytest.mark.slow
