@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.triangles import morton_order, number_vertices
+from sfm_app.geometry.triangles import number_vertices
 from sfm_app.jit import inlined_kernel, kernel
 from sfm_app.meshing.min_cut import sink_side
 from sfm_app.types import Surface
@@ -61,8 +61,8 @@ class Cloud:
     step: FloatArray
     """(N,) distance to the next points."""
 
-    def select(self, keep: NDArray[np.bool_] | IndexArray) -> "Cloud":
-        """Return the marked points (N,), or those of these numbers."""
+    def select(self, keep: NDArray[np.bool_]) -> "Cloud":
+        """Return the marked points (N,)."""
         return Cloud(self.points[keep], self.normals[keep], self.colors[keep], self.step[keep])
 
 
@@ -79,9 +79,8 @@ def thin(points: FloatArray, normals: FloatArray, colors: NDArray[np.uint8], ste
 
     normal = mean(normals)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    steps, middle = np.bincount(own, step, len(count)) / count, mean(points)
-    cloud = Cloud(middle, normal, np.rint(mean(colors)).astype(np.uint8), steps)
-    return cloud.select(morton_order(middle))  # Qhull takes a third less time for neighbors in memory
+    steps = np.bincount(own, step, len(count)) / count
+    return Cloud(mean(points), normal, np.rint(mean(colors)).astype(np.uint8), steps)
 
 
 class Sights(NamedTuple):
