@@ -64,16 +64,15 @@ def make_depth_maps_on_cpu(task: DepthTask, steps: Steps = STEPS) -> list[Reject
     if options.levels != 1:
         inputs = close_skies(inputs, [index for index in everything if matched[index] is None], task.map)
         shared = Shared(inputs)
-    for level in range(1, len(inputs.levels)):
-        task.map(Task(_match, shared, level), everything, "matching depths in smaller photos")
     if len(inputs.levels) > 1:
+        for level in range(1, len(inputs.levels)):
+            task.map(Task(_match, shared, level), everything, "matching depths in smaller photos")
         task.map(Task(_fill, shared), everything, "filling gaps in depth maps")
-    has_map = [store.has(view, "geometric") for view in task.views]
-    mapped = [index for index in everything if has_map[index]]
-    if len(inputs.levels) > 1:
+        mapped = [index for index in everything if store.has(task.views[index], "geometric")]
         task.map(Task(_propose, shared), mapped, "fitting planes to plain areas")
         task.map(Task(_fill_plain_areas, shared), mapped, "filling plain areas")
-    return [None if has_map[index] else rejected[index] for index in everything]
+    has_map = [store.has(view, "geometric") for view in task.views]
+    return [None if known else reason for known, reason in zip(has_map, rejected, strict=True)]
 
 
 def close_skies(inputs: _Inputs, matched: Sequence[int], spread: ParallelMap) -> _Inputs:

@@ -120,22 +120,32 @@ def test_a_plain_wall_and_a_dark_background_are_no_sky():
     assert not any(found.any() for found in skies_of(photograph_all(10.0)))
 
 
-def test_a_wall_stays_in_a_scene_with_a_sky():
-    photos = photograph_all(230.0)
+def photograph_window():
+    """Photos of a tower with a window as bright as the sky, whose direction changes from photo to photo."""
     walled = []
-    for photo in photos:
-        # a window of the tower as bright as the sky; its direction changes from photo to photo
+    for photo in photograph_all(230.0):
         at = photo.view.center[0] + 6.0 * (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL
         window = np.zeros_like(photo.blank)
         window[240:330] = np.abs(at - 0.5) < 0.5
         gray = np.where(window, 226, photo.gray).astype(np.uint8)
         walled.append((replace(photo, gray=gray, depth=np.where(window, np.float32(0), photo.depth)), window))
+    return walled
 
-    found = skies_of([photo for photo, _ in walled])
 
-    for (photo, window), own in zip(walled, found, strict=True):
+def test_a_wall_stays_in_a_scene_with_a_sky():
+    walled = photograph_window()
+
+    for (photo, window), own in zip(walled, skies_of([photo for photo, _ in walled]), strict=True):
         assert own[photo.blank].mean() > 0.98
         assert own[window].mean() < 0.05
+
+
+def test_any_blank_area_may_be_the_sky_in_a_scene_that_may_have_one():
+    areas, votes = areas_of([photo for photo, _ in photograph_window()])
+
+    assert max(one.labels.max() for one in areas) > 1  # the window is an area of its own
+    for one, found in zip(areas, possible_skies(areas, votes), strict=True):
+        np.testing.assert_array_equal(found, one.blank)
 
 
 @pytest.mark.parametrize(("backdrop", "possible"), [(sky, True), (plain_panel, False)])
