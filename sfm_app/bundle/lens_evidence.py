@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sfm_app.bundle import lens_parts
-from sfm_app.bundle.normal_equations import ReducedSystem
+from sfm_app.bundle.normal_equations import Bundle, ReducedSystem, bundle_scale, reduce
 from sfm_app.camera.projection import angle_limit, radius_at
 from sfm_app.camera.rows import CAMERA, CX, CY, FISHEYE, FX, FY, K1, K2, K3, K4, PANORAMA, PERSPECTIVE
-from sfm_app.geometry.least_squares import cavity, inverse_of_positive, posteriors
+from sfm_app.geometry.least_squares import NormalPriors, cavity, inverse_of_positive, posteriors
 from sfm_app.types.arrays import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -54,6 +54,10 @@ class OPTIONS:
     """Radii at which a lens is fitted to another. Chosen by hand."""
     least_reach: float = 0.2
     """Smallest share of the observed radius up to which a lens must not fold to be tried as another. Chosen by hand."""
+    same_focal: float = 1e-4
+    """Prior standard deviation of log f of a photo about that of its camera. By definition: rounding."""
+    own_focal: float = 0.2
+    """The same where each photo has its own: a zoom, or several devices. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,6 +282,34 @@ def _shorten_step(before: FloatArray, after: FloatArray, camera: int, priors: le
         return after
     halves = (before + 0.5**k * (after - before) for k in range(1, OPTIONS.clamps + 1))
     return next((one for one in halves if not priors.folds(camera, one)), before)
+
+
+def own_focals(bundle: Bundle, priors: lens_parts.LensPriors) -> tuple[FloatArray, FloatArray]:
+    """Weigh a focal length for each photo against one for all photos of a camera, with cameras, poses and points free.
+
+    Return (C,) by how much the first is more log-probable, and (I,) the changes of log f that explain the photos best.
+    Photos of the other cameras have their own meanwhile: what does not fit there must not count here.
+    """
+    photos, shared = len(bundle.R), bundle.params.size
+    rows = np.arange(photos)
+    own = replace(bundle, params=bundle.params[bundle.camera], camera=rows, family=bundle.family[bundle.camera])
+    reduced = reduce(replace(own, fixed=None), bundle_scale(bundle))
+    T, weight = _logarithm_jacobian(own.params), evidence_weight(reduced.noise_px)
+    # a parameter of a camera is that of all its photos; their own focals follow
+    column = np.concatenate([(CAMERA * bundle.camera[:, None] + np.arange(CAMERA)).ravel(), shared + rows])
+    row = np.concatenate([np.arange(own.params.size), CAMERA * rows + lens_parts.LOG_FOCAL])
+    H, g = np.zeros((shared + photos, shared + photos)), np.zeros(shared + photos)
+    np.add.at(H, (column[:, None], column), weight * (T.T @ (reduced.H @ T))[row[:, None], row])
+    np.add.at(g, column, weight * (T.T @ reduced.g)[row])
+    precision = priors.precision(np.ones((len(bundle.params), lens_parts.COUNT), np.bool_)).ravel()
+    away = np.append(priors.prior_offsets(bundle.params), np.zeros(photos))
+    # all photos have their own, or all but those of one camera
+    shares = np.vstack([np.zeros(photos, np.bool_), bundle.camera == np.arange(len(bundle.params))[:, None]])
+    widths = np.where(shares, OPTIONS.same_focal, OPTIONS.own_focal)
+    choices = len(shares)
+    precisions = np.hstack([np.tile(precision, (choices, 1)), widths**-2.0])
+    found = posteriors(H, g, NormalPriors(precisions, np.tile(away, (choices, 1)), np.zeros(choices)))
+    return found.log_evidence[0] - found.log_evidence[1:], found.steps[0, shared:]
 
 
 def suggests_other_family(params: FloatArray, family: int, reach: float, best: LensChoice, folding: bool) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm_app.colmap.backend import Camera, Reconstruction, all_points, pycolmap, translate_errors
-from sfm_app.colmap.bundle import drop_infinite_points, find_correspondences, improve_tracks, solve
+from sfm_app.colmap.bundle import drop_infinite_points, find_correspondences, improve_tracks, photos_per_camera, solve
 from sfm_app.colmap.model import bearing_vectors, pose_photo, posed_images, unposed_model
 from sfm_app.types.arrays import FloatArray, IndexArray
 
@@ -39,13 +39,17 @@ class PlacedPhotos:
 def read_placed(model_dir: Path) -> PlacedPhotos:
     """Read a model on disk."""
     with translate_errors("reading the model of a part"):
-        model = Reconstruction(model_dir)
-        images = posed_images(model)
-        poses = np.array([image.cam_from_world().matrix() for image in images], np.float64).reshape(-1, 3, 4)
-        points = sorted(all_points(model), key=lambda entry: entry[0])
-        tracks = [[(one.image_id, one.point2D_idx) for one in point.track.elements] for _, point in points]
-        cameras = {image.image_id: Camera(model.cameras[image.camera_id].todict()) for image in images}
-        X = np.array([point.xyz for _, point in points], np.float64).reshape(-1, 3)
+        return placed_photos(Reconstruction(model_dir))
+
+
+def placed_photos(model: Reconstruction) -> PlacedPhotos:
+    """Return the poses and points of a model."""
+    images = posed_images(model)
+    poses = np.array([image.cam_from_world().matrix() for image in images], np.float64).reshape(-1, 3, 4)
+    points = sorted(all_points(model), key=lambda entry: entry[0])
+    tracks = [[(one.image_id, one.point2D_idx) for one in point.track.elements] for _, point in points]
+    cameras = {image.image_id: Camera(model.cameras[image.camera_id].todict()) for image in images}
+    X = np.array([point.xyz for _, point in points], np.float64).reshape(-1, 3)
     elements = np.array([element for track in tracks for element in track], np.int64).reshape(-1, 2)
     R = poses[:, :, :3]
     centers = -np.einsum("nji,nj->ni", R, poses[:, :, 3])
@@ -69,6 +73,21 @@ def write_placed(database: Path, placed: PlacedPhotos) -> Reconstruction:
         model.add_point3D(xyz, track, np.zeros(3, np.uint8))
     model.tear_down()
     return model
+
+
+def divide_cameras(model: Reconstruction, database: Path, factors: Mapping[int, float]) -> Reconstruction:
+    """Return the model with the cameras that a database names for its photos, adjusted with their focals.
+
+    `factors` on the focal lengths, by photo, are where the adjustment begins.
+    """
+    placed = placed_photos(model)
+    for photo, factor in factors.items():
+        camera = placed.cameras[photo]
+        for place in camera.focal_length_idxs():
+            camera.params[place] *= factor
+    divided = write_placed(database, placed)
+    adjust_joined(divided, database, sorted(photos_per_camera(divided)))
+    return divided
 
 
 def _write_cameras(model: Reconstruction, placed: PlacedPhotos) -> None:

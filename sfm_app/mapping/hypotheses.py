@@ -13,6 +13,7 @@ import numpy as np
 
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import write_match_graph
+from sfm_app.colmap.joined_model import divide_cameras
 from sfm_app.colmap.model import cameras_by_photo, posed_photo_ids
 from sfm_app.errors import BackendError
 from sfm_app.mapping.attempt import (
@@ -23,6 +24,7 @@ from sfm_app.mapping.attempt import (
     choice_reason,
     doubt,
     explained_pairs,
+    judge_model,
     support,
 )
 from sfm_app.mapping.feature_retry import find_finer_evidence, lost_photos
@@ -143,19 +145,22 @@ def is_better(other: Outcome, best: Outcome, mapper: Mapper) -> bool:
     The one that explains more wins, unless it merges two places that the other one separates: look-alikes explain more,
     and are wrong.
     """
-    explains_more = _explains_more(other, best)
+    explains_more = _explains_more(other, best, mapper)
     winner, loser = (other, best) if explains_more else (best, other)
     return explains_more is not _separates_places(loser, winner, mapper)
 
 
-def _explains_more(other: Outcome, best: Outcome) -> bool:
+def _explains_more(other: Outcome, best: Outcome, mapper: Mapper) -> bool:
     """Return whether a main model explains more on the same evidence.
 
     Of models that explain about equally much, the one with more photos, then the one with fewer cameras wins. More
-    cameras must place more photos or remove contradictions.
+    cameras must place more photos or remove contradictions, unless a shared camera clearly does not fit.
     """
     if other.main is None or best.main is None:
         return best.main is None and other.main is not None
+    fewer, more = (best, other) if other.cameras > best.cameras else (other, best)
+    if more.cameras > fewer.cameras and more.photos >= fewer.photos and _own_focals(fewer, mapper):
+        return more is other
     most = OPTIONS.max_remaining_share * best.main.contradicted_share
     if other.cameras > best.cameras and other.photos <= best.photos and other.main.contradicted_share > most:
         return False  # with a camera of its own, a photo fits more than it should
@@ -257,40 +262,65 @@ def _shared_camera_reason(best: Outcome, mapper: Mapper) -> str:
         return ""
     # pairs on a plane are not counted as fits
     photos = max(best.photos, len(photos_with_geometry(best.trusted)))
-    if not OPTIONS.min_photos <= photos <= OPTIONS.max_photos or _camera_per_photo(best) is None:
+    if not OPTIONS.min_photos <= photos <= OPTIONS.max_photos or _camera_per_photo(best, mapper) is None:
         return ""
     is_contradicted = best.main.contradicted_share > MAPPING.guessed_contradicted_share
-    return "a shared camera does not fit" if is_contradicted or _focal_reason(best, mapper) else ""
+    is_doubtful = is_contradicted or _focal_reason(best, mapper) or _own_focals(best, mapper)
+    return "a shared camera does not fit" if is_doubtful else ""
+
+
+def _own_focals(best: Outcome, mapper: Mapper) -> dict[int, float]:
+    if best.main is None or not OPTIONS.min_photos <= best.photos <= OPTIONS.max_photos:
+        return {}
+    return mapper.find_own_focals(best.main.model)
 
 
 def _with_camera_per_photo(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
-    intrinsics = _camera_per_photo(best)
-    if intrinsics is not None:
+    intrinsics, factors = _camera_per_photo(best, mapper), _own_focals(best, mapper)
+    if intrinsics is None or best.main is None:
+        return
+    if not factors:
         yield mapper.map(replace(best.trusted, intrinsics=intrinsics)).with_earlier(best)
+        return
+    # relative poses from guessed focals would be worse than those of the model
+    divided = replace(best, evidence=replace(best.evidence, intrinsics=intrinsics), trials=())
+    mapper.write(divided)
+    with translate_errors("giving photos a camera each"):
+        model = divide_cameras(best.main.model, divided.run.workspace.database, factors)
+    attempt = judge_model(divided.trusted, best.main.mapper, "with a camera for each photo", model, mapper.run)
+    if isinstance(attempt, Attempt):
+        yield replace(divided, models=(attempt, *best.models[1:]), notes=(attempt.note,))
 
 
-def _camera_per_photo(best: Outcome) -> Intrinsics | None:
-    """Give each photo its own camera where pairs do not determine the shared one; None if there is none such."""
+def _camera_per_photo(best: Outcome, mapper: Mapper) -> Intrinsics | None:
+    """Give each photo its own camera where pairs do not determine the shared one, or it does not fit; None if it does.
+
+    A shared camera that does not fit has lost its claim to be known.
+    """
     if best.main is None:
         return None
     evidence, shared = best.evidence, best.evidence.intrinsics
+    factors = _own_focals(best, mapper)
     focals = {photo: float(K[0, 0] * K[1, 1]) ** 0.5 for photo, (K, *_) in cameras_by_photo(best.main.model).items()}
     focal_of = {evidence.camera_name(k): focals[k] for k in posed_photo_ids(best.main.model) if k in focals}
-    members: dict[str, list[str]] = {}
-    for photo, image in evidence.matches.images.items():
-        members.setdefault(evidence.camera_name(photo), []).append(image.name)
-    divided = [name for name, photos in members.items() if len(photos) > 1 and not shared.cameras[name].identifiable]
-    if not divided:
-        return None
+    misfits = {evidence.camera_name(photo) for photo in factors}
+    members: dict[str, list[int]] = {}
+    for photo in sorted(evidence.matches.images, key=lambda photo: evidence.matches.images[photo].name):
+        members.setdefault(evidence.camera_name(photo), []).append(photo)
     cameras, camera_of = dict(shared.cameras), dict(shared.camera_of)
-    for name in divided:
-        camera = cameras.pop(name)
+    for name, photos in members.items():
+        camera = shared.cameras[name]
+        is_open = name in misfits and not (camera.is_given or camera.is_claimed)
+        if len(photos) == 1 or (camera.identifiable and not is_open):
+            continue
+        del cameras[name]
         focal_px, reason = focal_of.get(name, camera.focal_px), "its photos may each be of another camera"
         taken = {*shared.cameras, *cameras}
         names = chain([name], (other for number in count(2) if (other := f"{name} #{number}") not in taken))
-        for photo_name, own in zip(sorted(members[name]), names, strict=False):
-            cameras[own], camera_of[photo_name] = guess_again(camera, focal_px, reason), own
-    return replace(shared, cameras=cameras, camera_of=camera_of)
+        for photo, own in zip(photos, names, strict=False):
+            cameras[own] = guess_again(camera, focal_px * factors.get(photo, 1.0), reason)
+            camera_of[evidence.matches.images[photo].name] = own
+    return None if cameras.keys() == shared.cameras.keys() else replace(shared, cameras=cameras, camera_of=camera_of)
 
 
 # The cameras of the model, which correct the relative poses.

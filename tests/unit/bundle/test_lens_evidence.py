@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.bundle.lens_evidence import estimate_lenses
+from sfm_app.bundle.lens_evidence import estimate_lenses, own_focals
 from sfm_app.bundle.lens_parts import PERSPECTIVE_PARTS, CameraRule, LensPriors
 from sfm_app.bundle.normal_equations import Bundle, bundle_scale, project, reduce
 from sfm_app.camera.rows import CAMERA, PERSPECTIVE
@@ -188,3 +188,37 @@ def test_a_claim_determines_what_the_photos_leave_open():
     assert plain.deviations[0, 0] > 1500
     assert found.params[0, :2] == pytest.approx([30300.0] * 2, abs=150)
     assert 250 < found.deviations[0, 0] < 0.6 * plain.deviations[0, 0]
+
+
+# A focal length for each photo.
+
+
+def as_one_camera(bundle, *params):
+    return replace(bundle, params=padded(params), camera=0 * bundle.camera, family=bundle.family[:1])
+
+
+@pytest.mark.parametrize("share", [0.04, 0.1])
+def test_photos_of_two_cameras_of_one_size_have_the_focals_of_these(share):
+    near, far = ([900.0 * factor, 900.0 * factor, *PLAIN[2:]] for factor in (1 - share, 1 + share))
+    bundle = as_one_camera(seen(near, far, photos=4), *PLAIN)
+    log_odds, changes = own_focals(bundle, asked(bundle, True))
+    assert log_odds[0] > 20
+    assert changes == pytest.approx(np.log(np.repeat([1 - share, 1 + share], 4)), abs=0.01)
+
+
+@pytest.mark.parametrize("change", [{}, {2: 540.0}, {4: -0.05}, {1: 950.0}])
+def test_photos_of_one_camera_have_its_focal_even_if_its_lens_is_not_known_yet(change):
+    true = list(PLAIN)
+    for place, value in change.items():
+        true[place] = value
+    bundle = as_one_camera(seen(true), *PLAIN)
+    log_odds, changes = own_focals(bundle, asked(bundle, True))
+    assert log_odds[0] < -5 and np.ptp(changes) < 0.02
+
+
+def test_only_the_photos_of_the_camera_that_does_not_fit_have_focals_of_their_own():
+    near, far = ([900.0 * factor, 900.0 * factor, *PLAIN[2:]] for factor in (0.9, 1.1))
+    bundle = seen(near, far, list(PLAIN), photos=4)
+    bundle = replace(bundle, params=padded(PLAIN, PLAIN), camera=bundle.camera // 2, family=bundle.family[:2])
+    log_odds, changes = own_focals(bundle, asked(bundle, True, True))
+    assert log_odds[0] > 20 and log_odds[1] < 0 and np.ptp(changes[8:]) < 0.02

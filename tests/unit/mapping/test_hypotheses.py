@@ -4,12 +4,13 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import get_args
 
+import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.bundle import adjust
+from sfm_app.colmap.bundle import adjust, solve
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.model import posed_photo_ids
+from sfm_app.colmap.model import posed_images, posed_photo_ids
 from sfm_app.errors import BackendError, ClusterError, ConfigError, NumericalError
 from sfm_app.mapping.attempt import Attempt, PairSupport
 from sfm_app.mapping.hypotheses import ALL, OPTIONS, is_better, learned_intrinsics
@@ -23,6 +24,7 @@ from tests.unit.mapping.fakes import (
     FOCAL,
     GOOD,
     TRUE,
+    Fakes,
     focals_in,
     geometries_in,
     hypothesis,
@@ -37,6 +39,7 @@ pytestmark = pytest.mark.slow
 
 RIVAL = "colmap-defaults"
 GUESS = {"method": "guess", "identifiable": False}
+MIDDLE = np.array([512.0, 384.0])
 
 
 # The loop.
@@ -329,8 +332,9 @@ def chain(number):
 PER_PHOTO = hypothesis("camera-per-photo")
 
 
-def is_asked(best, **settings):
-    return bool(PER_PHOTO.reason(best, Mapper(SimpleNamespace(settings=Settings.from_mapping(settings)))))
+def is_asked(best, own_focals=(), **settings):
+    mappers = Mappers(find_own_focals=lambda _: dict(own_focals))
+    return bool(PER_PHOTO.reason(best, Mapper(SimpleNamespace(settings=Settings.from_mapping(settings)), mappers)))
 
 
 @pytest.mark.parametrize(
@@ -366,7 +370,15 @@ def test_without_a_model_it_is_not_asked(cameras):
 
 
 def test_a_camera_that_pairs_determine_is_not_divided(cameras):
-    assert not is_asked(best_of(attempt(photos(6), 2), number=6, views=chain(6), intrinsics=cameras()))
+    known = best_of(attempt(photos(6), 2), number=6, views=chain(6), intrinsics=cameras())
+    assert not is_asked(known)
+    assert is_asked(known, {1: 1.1, 6: 0.9})  # unless it does not fit
+
+
+@pytest.mark.parametrize("method", ["given", "kept", "claim"])
+def test_a_camera_that_somebody_stated_is_not_divided_by_focals(cameras, method):
+    stated = best_of(attempt(photos(6), 0), number=6, views=chain(6), intrinsics=cameras(method=method))
+    assert not is_asked(stated, {1: 1.1, 6: 0.9})
 
 
 def test_every_photo_gets_a_guess_of_its_own_that_begins_where_mapping_ended(synthetic, run, cameras, mapped):
@@ -388,7 +400,7 @@ def test_every_photo_gets_a_guess_of_its_own_that_begins_where_mapping_ended(syn
 def judged(cameras):
     """Whether the judge prefers a model to one of 6 photos; `places` are the judgments of the places of both."""
 
-    def make(other, best=None, places=(), **intrinsics):
+    def make(other, best=None, places=(), own_focals=(), **intrinsics):
         judgments = dict(zip(("other", "best"), places, strict=False))
         outcomes = [
             best_of(*models, number=9, intrinsics=cameras(**GUESS))
@@ -396,7 +408,11 @@ def judged(cameras):
         ]
         outcomes[0] = replace(outcomes[0], evidence=replace(outcomes[1].evidence, **intrinsics))
         names = dict(zip((one.models for one in outcomes), ("other", "best"), strict=True))
-        mapper = SimpleNamespace(judge_places=lambda models: judgments.get(names[models], ([], 0)))
+        focals = {one.models[0].model: dict(own_focals) for one in outcomes[1:] if one.models}
+        mapper = SimpleNamespace(
+            judge_places=lambda models: judgments.get(names[models], ([], 0)),
+            find_own_focals=lambda model: focals.get(model, {}),
+        )
         return is_better(*outcomes, mapper)
 
     return make
@@ -421,12 +437,57 @@ def test_of_models_that_explain_equally_much_the_judge_prefers_more_photos_then_
         assert judged([attempt(photos(7), remaining, 500)], contradicted, intrinsics=each)
 
 
+def test_the_judge_prefers_a_camera_for_each_photo_where_one_clearly_does_not_fit(judged):
+    each, clear = SimpleNamespace(camera_name=lambda image: image.name), {1: 1.1, 6: 0.9}
+    assert judged([attempt(photos(6), 0, 999)], own_focals=clear, intrinsics=each)
+    assert not judged([attempt(photos(6), 0, 999)], intrinsics=each)
+    assert not judged([attempt(photos(5), 0, 999)], own_focals=clear, intrinsics=each)  # but no photo may go
+
+
 def test_the_judge_prefers_places_apart(judged):
     join = LookAlikes(((1, 4),), 0.9)
     folded, fewer = [attempt(photos(6), 0, 5000)], [attempt(photos(6), 0, 500)]
     assert judged(fewer, places=(([], 10), ([join], 20))) and not judged(folded, places=(([join], 20), ([], 10)))
     assert not judged(fewer, places=(([join], 11), ([join], 20)))  # too few of the missing overlaps go
     assert not judged([attempt(photos(5), 0, 500)], places=(([], 0), ([join], 20)))  # too many photos go
+
+
+@pytest.fixture
+def two_zooms(synthetic):
+    """The synthetic photos, of which 4 to 6 show everything larger, and the best model with one focal."""
+
+    def make(factor):
+        def enlarge(x):
+            return MIDDLE + factor * (x - MIDDLE)
+
+        matches, model = synthetic.matches, synthetic.copy()
+        keypoints = {photo: enlarge(x) if photo > 3 else x for photo, x in matches.keypoints.items()}
+        for photo in (4, 5, 6):
+            for keypoint in model.images[photo].points2D:
+                keypoint.xy = enlarge(keypoint.xy)
+        solve(model, [1])
+        return replace(synthetic, model=model, matches=replace(matches, keypoints=keypoints))
+
+    return make
+
+
+@pytest.mark.parametrize("factor", [1.1, 0.8])
+def test_photos_with_two_focals_get_theirs_whatever_pairs_say(two_zooms, run, cameras, factor):
+    zoomed = two_zooms(factor)
+    fakes = Fakes(zoomed)
+
+    found = fakes.improve(fakes.best(cameras(), run(), fakes.attempt(zoomed.model)), PER_PHOTO)
+
+    assert trials_of(found) == [("camera-per-photo", True, "with a camera for each photo: 6 photos")]
+    focals = [found.main.model.cameras[image.camera_id].params[0] for image in posed_images(found.main.model)]
+    assert np.allclose(focals, FOCAL * np.repeat([1, factor], 3), rtol=0.02)
+    assert cameras_in(run().workspace.database) == found.cameras == 6
+
+
+def test_photos_whose_focals_differ_as_by_focusing_keep_their_camera(two_zooms, run, cameras):
+    fakes = Fakes(two_zooms(1.01))
+    best = fakes.best(cameras(), run(), fakes.attempt(fakes.synthetic.model))
+    assert fakes.improve(best, PER_PHOTO) is best
 
 
 @pytest.fixture
