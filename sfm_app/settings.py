@@ -102,7 +102,7 @@ class CalibrationSettings(Section):
 
 
 HypothesisName = Literal[
-    "false-joins", "colmap-defaults", "other-focals", "camera-per-photo", "learned-cameras",
+    "false-joins", "colmap-defaults", "other-focals", "other-cameras", "learned-cameras",
     "finer-features", "mapped-anew", "look-alikes", "global-mapper", "splits", "lens-families",
     "rolling-shutter",
 ]  # fmt: skip
@@ -112,7 +112,7 @@ HYPOTHESES: Mapping[HypothesisName, str] = {
     "false-joins": "leaving out the ambiguous pairs",
     "colmap-defaults": "COLMAP's default pipeline",
     "other-focals": "other focal lengths",
-    "camera-per-photo": "a camera for each photo (a zoom, or several devices)",
+    "other-cameras": "other cameras for photos of one size (a zoom, or several devices)",
     "learned-cameras": "mapping again with the cameras of the model",
     "finer-features": "finer features for unplaced photos",
     "mapped-anew": "mapping all photos again",

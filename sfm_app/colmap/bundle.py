@@ -17,9 +17,9 @@ from sfm_app.bundle.lens_evidence import (
     LensChoice,
     LensEstimate,
     convert_lens,
+    divide_by_focal,
     estimate_lenses,
     family_evidence,
-    own_focals,
     suggests_other_family,
 )
 from sfm_app.bundle.normal_equations import Bundle, best_step, bundle_scale, cost, elimination_width, reduce
@@ -147,10 +147,6 @@ class AdjustmentOptions:
     """Photos of a camera on which its families are compared, at even steps among all. Chosen by hand."""
     runners_up: int = 3
     """Rivals of the same family in the manifest. Chosen by hand."""
-    own_log_odds: float = 3.0
-    """Least log odds of a focal length for each photo: one camera in twenty may have several. Chosen by hand."""
-    own_change: float = 0.03
-    """Least change of log f among the photos of a camera; focusing changes less. Chosen on oats23, which has 0.02."""
 
 
 OPTIONS = AdjustmentOptions()
@@ -380,18 +376,14 @@ def _observed_reach(bundle: Bundle, row: int) -> float:
     return float(np.quantile(np.hypot(*offsets.T), OPTIONS.outermost)) if len(x) else 0.0
 
 
-def find_own_focals(model: Reconstruction) -> dict[int, float]:
-    """Return by photo the factor on its focal length, of cameras whose photos surely have different focal lengths."""
+def find_cameras(model: Reconstruction) -> dict[int, tuple[int, float]]:
+    """Return by photo a number of its camera and a factor on its focal, where photos of one camera clearly differ."""
     ids, bundle = read_bundle(model)
-    log_odds, changes = own_focals(bundle, lens_priors(model, ids, bundle))
-    factors = dict[int, float]()
-    for row, odds in enumerate(log_odds):
-        members = np.flatnonzero(bundle.camera == row)
-        around = changes[members] - changes[members].mean()
-        if odds >= OPTIONS.own_log_odds and np.abs(around).max() >= OPTIONS.own_change:
-            factors |= dict(zip(members.tolist(), np.exp(around).tolist(), strict=True))
-    photos = sorted(model.reg_image_ids())
-    return {photos[row]: factor for row, factor in sorted(factors.items())}
+    numbers, changes = divide_by_focal(bundle, lens_priors(model, ids, bundle))
+    parts = Counter(zip(bundle.camera.tolist(), numbers.tolist(), strict=True))
+    divided = [camera for camera, count in Counter(camera for camera, _ in parts).items() if count > 1]
+    found = zip(sorted(model.reg_image_ids()), numbers.tolist(), np.exp(changes).tolist(), bundle.camera, strict=True)
+    return {photo: (number, factor) for photo, number, factor, camera in found if camera in divided}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

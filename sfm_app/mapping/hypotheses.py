@@ -5,9 +5,10 @@ features. The loop keeps an outcome that explains more.
 """
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import chain, count
+from itertools import count
 
 import numpy as np
 
@@ -159,7 +160,7 @@ def _explains_more(other: Outcome, best: Outcome, mapper: Mapper) -> bool:
     if other.main is None or best.main is None:
         return best.main is None and other.main is not None
     fewer, more = (best, other) if other.cameras > best.cameras else (other, best)
-    if more.cameras > fewer.cameras and more.photos >= fewer.photos and _own_focals(fewer, mapper):
+    if more.cameras > fewer.cameras and more.photos >= fewer.photos and _divided(fewer, mapper):
         return more is other
     most = OPTIONS.max_remaining_share * best.main.contradicted_share
     if other.cameras > best.cameras and other.photos <= best.photos and other.main.contradicted_share > most:
@@ -251,76 +252,81 @@ def _with_other_focals(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
         yield mapper.map(replace(best.trusted, intrinsics=guess)).with_earlier(best)
 
 
-# A camera per photo, for a zoom or several devices. Photos of one size share a camera until their pairs contradict
-# that. Pairs of a camera that moves forward or round one point never do. A model does: with one focal, it contradicts
-# matches that are right pair by pair.
+# Other cameras, for a zoom or several devices. Photos of one size share a camera until their pairs contradict that.
+# Pairs of a camera that moves forward, round one point or along a plane never do. The model does: its photos show
+# focal lengths of their own, or, with one focal, it contradicts matches that are right pair by pair.
 
 
 def _shared_camera_reason(best: Outcome, mapper: Mapper) -> str:
-    """Return why photos of one size may have a camera each: the model is contradicted, or lacks many photos."""
+    """Return why photos of one size may have other cameras: their focals differ, matches contradict, or many lack."""
     if best.main is None or mapper.run.settings.photos.cameras != "auto":
         return ""
+    if _divided(best, mapper):
+        return "photos of one size have different focal lengths"
     # pairs on a plane are not counted as fits
     photos = max(best.photos, len(photos_with_geometry(best.trusted)))
-    if not OPTIONS.min_photos <= photos <= OPTIONS.max_photos or _camera_per_photo(best, mapper) is None:
+    if not OPTIONS.min_photos <= photos <= OPTIONS.max_photos or not _each(best):
         return ""
     is_contradicted = best.main.contradicted_share > MAPPING.guessed_contradicted_share
-    is_doubtful = is_contradicted or _focal_reason(best, mapper) or _own_focals(best, mapper)
-    return "a shared camera does not fit" if is_doubtful else ""
+    return "a shared camera does not fit" if is_contradicted or _focal_reason(best, mapper) else ""
 
 
-def _own_focals(best: Outcome, mapper: Mapper) -> dict[int, float]:
+def _divided(best: Outcome, mapper: Mapper) -> dict[int, tuple[int, float]]:
+    """Return the number of the camera of each photo whose shared camera clearly does not fit, and its focal's factor.
+
+    Cameras that somebody has stated stay. In large models, this costs more than it promises.
+    """
     if best.main is None or not OPTIONS.min_photos <= best.photos <= OPTIONS.max_photos:
         return {}
-    return mapper.find_own_focals(best.main.model)
+    found = mapper.find_cameras(best.main.model)
+    stated = {photo for photo in found for one in (best.evidence.camera(photo),) if one.is_given or one.is_claimed}
+    return {photo: camera for photo, camera in found.items() if photo not in stated}
 
 
-def _with_camera_per_photo(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
-    intrinsics, factors = _camera_per_photo(best, mapper), _own_focals(best, mapper)
-    if intrinsics is None or best.main is None:
+def _each(best: Outcome) -> dict[int, tuple[int, float]]:
+    """Return a number for the camera of each photo, where pairs do not determine a shared one, and the factor 1."""
+    evidence = best.evidence
+    shared = Counter(map(evidence.camera_name, evidence.matches.images))
+    return {
+        photo: (photo, 1.0)
+        for photo in evidence.matches.images
+        if shared[evidence.camera_name(photo)] > 1 and not evidence.camera(photo).identifiable
+    }
+
+
+def _with_other_cameras(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
+    divided = _divided(best, mapper)
+    if best.main is None or not divided:
+        yield mapper.map(replace(best.trusted, intrinsics=_regroup(best, _each(best)))).with_earlier(best)
         return
-    if not factors:
-        yield mapper.map(replace(best.trusted, intrinsics=intrinsics)).with_earlier(best)
-        return
-    # relative poses from guessed focals would be worse than those of the model
-    divided = replace(best, evidence=replace(best.evidence, intrinsics=intrinsics), trials=())
-    mapper.write(divided)
-    with translate_errors("giving photos a camera each"):
-        model = divide_cameras(best.main.model, divided.run.workspace.database, factors)
-    attempt = judge_model(divided.trusted, best.main.mapper, "with a camera for each photo", model, mapper.run)
+    # the model knows their focals better than pairs would know their poses from these
+    other = replace(best, evidence=replace(best.evidence, intrinsics=_regroup(best, divided)), trials=())
+    mapper.write(other)
+    with translate_errors("giving photos other cameras"):
+        factors = {photo: factor for photo, (_, factor) in divided.items()}
+        model = divide_cameras(best.main.model, other.run.workspace.database, factors)
+    how = f"with {other.cameras} instead of {best.cameras} camera{'s' if best.cameras > 1 else ''}"
+    attempt = judge_model(other.trusted, best.main.mapper, how, model, mapper.run)
     if isinstance(attempt, Attempt):
-        yield replace(divided, models=(attempt, *best.models[1:]), notes=(attempt.note,))
+        yield replace(other, models=(attempt, *best.models[1:]), notes=(attempt.note,))
 
 
-def _camera_per_photo(best: Outcome, mapper: Mapper) -> Intrinsics | None:
-    """Give each photo its own camera where pairs do not determine the shared one, or it does not fit; None if it does.
-
-    A shared camera that does not fit has lost its claim to be known.
-    """
-    if best.main is None:
-        return None
+def _regroup(best: Outcome, found: Mapping[int, tuple[int, float]]) -> Intrinsics:
+    """Give photos cameras by number: guesses of the focals of the model, times a factor."""
     evidence, shared = best.evidence, best.evidence.intrinsics
-    factors = _own_focals(best, mapper)
-    focals = {photo: float(K[0, 0] * K[1, 1]) ** 0.5 for photo, (K, *_) in cameras_by_photo(best.main.model).items()}
-    focal_of = {evidence.camera_name(k): focals[k] for k in posed_photo_ids(best.main.model) if k in focals}
-    misfits = {evidence.camera_name(photo) for photo in factors}
-    members: dict[str, list[int]] = {}
-    for photo in sorted(evidence.matches.images, key=lambda photo: evidence.matches.images[photo].name):
-        members.setdefault(evidence.camera_name(photo), []).append(photo)
-    cameras, camera_of = dict(shared.cameras), dict(shared.camera_of)
-    for name, photos in members.items():
-        camera = shared.cameras[name]
-        is_open = name in misfits and not (camera.is_given or camera.is_claimed)
-        if len(photos) == 1 or (camera.identifiable and not is_open):
-            continue
-        del cameras[name]
-        focal_px, reason = focal_of.get(name, camera.focal_px), "its photos may each be of another camera"
-        taken = {*shared.cameras, *cameras}
-        names = chain([name], (other for number in count(2) if (other := f"{name} #{number}") not in taken))
-        for photo, own in zip(photos, names, strict=False):
-            cameras[own] = guess_again(camera, focal_px * factors.get(photo, 1.0), reason)
-            camera_of[evidence.matches.images[photo].name] = own
-    return None if cameras.keys() == shared.cameras.keys() else replace(shared, cameras=cameras, camera_of=camera_of)
+    focals = {} if best.main is None else cameras_by_photo(best.main.model)
+    focal_of = {evidence.camera_name(k): float(K[0, 0] * K[1, 1]) ** 0.5 for k, (K, *_) in focals.items()}
+    cameras, camera_of, names = dict(shared.cameras), dict(shared.camera_of), dict[int, str]()
+    for photo in sorted(found, key=lambda photo: evidence.matches.images[photo].name):
+        (number, factor), name = found[photo], evidence.camera_name(photo)
+        if number not in names:
+            free = (other for k in count(2) if (other := f"{name} #{k}") not in cameras)
+            names[number] = name if name not in names.values() else next(free)
+            focal_px = factor * focal_of.get(name, shared.cameras[name].focal_px)
+            reason = "photos of its size may be of other cameras"
+            cameras[names[number]] = guess_again(shared.cameras[name], focal_px, reason)
+        camera_of[evidence.matches.images[photo].name] = names[number]
+    return replace(shared, cameras=cameras, camera_of=camera_of)
 
 
 # The cameras of the model, which correct the relative poses.
@@ -386,7 +392,7 @@ RIVAL = Hypothesis("colmap-defaults", _rival_reason, _map_rival)
 FIRST_LOOK = (
     Hypothesis("false-joins", _false_joins_reason, _without_false_joins, repeats=OVERLAPS.max_passes),
     Hypothesis("other-focals", _focal_reason, _with_other_focals),
-    Hypothesis("camera-per-photo", _shared_camera_reason, _with_camera_per_photo),
+    Hypothesis("other-cameras", _shared_camera_reason, _with_other_cameras, repeats=OVERLAPS.max_passes),
     Hypothesis("learned-cameras", _learning_reason, _with_learned_cameras),
     RIVAL,
 )

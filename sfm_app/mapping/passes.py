@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from sfm_app.camera.models import GUESSED_FOCAL, guessed_camera_matrix
 from sfm_app.colmap.backend import Reconstruction, run_interruptible, translate_errors
-from sfm_app.colmap.bundle import find_own_focals
+from sfm_app.colmap.bundle import find_cameras
 from sfm_app.colmap.database import keep_raw_matches, write_calibrations, write_pose_graph
 from sfm_app.colmap.mapping import copy_database, map_with_colmap_defaults
 from sfm_app.colmap.model import posed_photo_ids
@@ -257,7 +257,7 @@ class Mappers:
     map_in_parts: Callable[..., tuple[list[MappingResult], tuple[LookAlikes, ...]]] = map_in_parts
     map_rival: Callable[[Evidence, RunContext], Attempt | NoModel] = map_rival
     judge_places: Callable[[Sequence[Attempt]], tuple[list[LookAlikes], int]] = judge_places
-    find_own_focals: Callable[[Reconstruction], dict[int, float]] = find_own_focals
+    find_cameras: Callable[[Reconstruction], dict[int, tuple[int, float]]] = find_cameras
 
 
 MAPPERS = Mappers()
@@ -269,7 +269,7 @@ class Mapper:
     def __init__(self, run: RunContext, mappers: Mappers = MAPPERS) -> None:
         self.run, self.mappers = run, mappers
         self.judge_places = cache(mappers.judge_places)
-        self.find_own_focals = cache(mappers.find_own_focals)
+        self.find_cameras = cache(mappers.find_cameras)
 
     def map(self, evidence: Evidence, chances: int = OVERLAPS.max_passes) -> Outcome:
         """Map all groups from new relative poses, again up to `chances` times where parts merge two places."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.bundle.lens_evidence import estimate_lenses, own_focals
+from sfm_app.bundle.lens_evidence import divide_by_focal, estimate_lenses
 from sfm_app.bundle.lens_parts import PERSPECTIVE_PARTS, CameraRule, LensPriors
 from sfm_app.bundle.normal_equations import Bundle, bundle_scale, project, reduce
 from sfm_app.camera.rows import CAMERA, PERSPECTIVE
@@ -190,35 +190,49 @@ def test_a_claim_determines_what_the_photos_leave_open():
     assert 250 < found.deviations[0, 0] < 0.6 * plain.deviations[0, 0]
 
 
-# A focal length for each photo.
+# Photos of other cameras.
 
 
 def as_one_camera(bundle, *params):
     return replace(bundle, params=padded(params), camera=0 * bundle.camera, family=bundle.family[:1])
 
 
+def with_focal(factor):
+    return [900.0 * factor, 900.0 * factor, *PLAIN[2:]]
+
+
 @pytest.mark.parametrize("share", [0.04, 0.1])
-def test_photos_of_two_cameras_of_one_size_have_the_focals_of_these(share):
-    near, far = ([900.0 * factor, 900.0 * factor, *PLAIN[2:]] for factor in (1 - share, 1 + share))
-    bundle = as_one_camera(seen(near, far, photos=4), *PLAIN)
-    log_odds, changes = own_focals(bundle, asked(bundle, True))
-    assert log_odds[0] > 20
+def test_photos_of_two_cameras_of_one_size_are_told_apart(share):
+    bundle = as_one_camera(seen(with_focal(1 - share), with_focal(1 + share), photos=4), *PLAIN)
+    numbers, changes = divide_by_focal(bundle, asked(bundle, True))
+    assert sorted(numbers) == [0] * 4 + [1] * 4 and len(set(numbers[:4])) == len(set(numbers[4:])) == 1
     assert changes == pytest.approx(np.log(np.repeat([1 - share, 1 + share], 4)), abs=0.01)
 
 
+def test_photos_of_a_zoom_get_a_camera_each():
+    factors = np.linspace(0.85, 1.15, 8)
+    bundle = as_one_camera(seen(*map(with_focal, factors), photos=1), *PLAIN)
+    numbers, changes = divide_by_focal(bundle, asked(bundle, True))
+    assert sorted(numbers) == list(range(8)) and changes == pytest.approx(np.log(factors), abs=0.02)
+
+
 @pytest.mark.parametrize("change", [{}, {2: 540.0}, {4: -0.05}, {1: 950.0}])
-def test_photos_of_one_camera_have_its_focal_even_if_its_lens_is_not_known_yet(change):
+def test_photos_of_one_camera_stay_together_even_if_its_lens_is_not_known_yet(change):
     true = list(PLAIN)
     for place, value in change.items():
         true[place] = value
     bundle = as_one_camera(seen(true), *PLAIN)
-    log_odds, changes = own_focals(bundle, asked(bundle, True))
-    assert log_odds[0] < -5 and np.ptp(changes) < 0.02
+    assert not divide_by_focal(bundle, asked(bundle, True))[0].any()
 
 
-def test_only_the_photos_of_the_camera_that_does_not_fit_have_focals_of_their_own():
-    near, far = ([900.0 * factor, 900.0 * factor, *PLAIN[2:]] for factor in (0.9, 1.1))
-    bundle = seen(near, far, list(PLAIN), photos=4)
+def test_a_difference_as_by_focusing_divides_no_camera():
+    bundle = as_one_camera(seen(with_focal(0.985), with_focal(1.015), photos=4), *PLAIN)
+    assert not divide_by_focal(bundle, asked(bundle, True))[0].any()
+
+
+def test_only_the_camera_that_does_not_fit_is_divided():
+    bundle = seen(with_focal(0.9), with_focal(1.1), list(PLAIN), photos=4)
     bundle = replace(bundle, params=padded(PLAIN, PLAIN), camera=bundle.camera // 2, family=bundle.family[:2])
-    log_odds, changes = own_focals(bundle, asked(bundle, True, True))
-    assert log_odds[0] > 20 and log_odds[1] < 0 and np.ptp(changes[8:]) < 0.02
+    numbers, _ = divide_by_focal(bundle, asked(bundle, True, True))
+    assert len(set(numbers[:4])) == len(set(numbers[4:8])) == 1 and numbers[0] != numbers[4]
+    assert numbers[8:].tolist() == [1] * 4

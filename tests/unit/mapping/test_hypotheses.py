@@ -70,7 +70,7 @@ def test_a_hypothesis_that_is_switched_off_is_not_tried(synthetic, run, cameras,
     few = without(synthetic.copy(), [4, 5, 6])
     seen = mapped(few)
     asked = mapped.rival(with_camera(synthetic.copy(), TRUE))
-    off = ["colmap-defaults", "other-focals", "camera-per-photo", "learned-cameras"]
+    off = ["colmap-defaults", "other-focals", "other-cameras", "learned-cameras"]
     found = mapped.outcome(cameras(**GUESS), run(without=off))
     assert len(seen) == 1 and asked == [] and found.main.model is few
     assert trials_of(found) == [("first-pass", True, "3 photos")]
@@ -329,11 +329,15 @@ def chain(number):
     return ViewGraph({(k, k + 1): fit for k in range(1, number)}, {})
 
 
-PER_PHOTO = hypothesis("camera-per-photo")
+PER_PHOTO = hypothesis("other-cameras")
 
 
-def is_asked(best, own_focals=(), **settings):
-    mappers = Mappers(find_own_focals=lambda _: dict(own_focals))
+APART = {1: (0, 0.9), 6: (1, 1.1)}
+"""Photos with the numbers of their cameras, and factors on their focals."""
+
+
+def is_asked(best, apart=(), **settings):
+    mappers = Mappers(find_cameras=lambda _: dict(apart))
     return bool(PER_PHOTO.reason(best, Mapper(SimpleNamespace(settings=Settings.from_mapping(settings)), mappers)))
 
 
@@ -372,13 +376,13 @@ def test_without_a_model_it_is_not_asked(cameras):
 def test_a_camera_that_pairs_determine_is_not_divided(cameras):
     known = best_of(attempt(photos(6), 2), number=6, views=chain(6), intrinsics=cameras())
     assert not is_asked(known)
-    assert is_asked(known, {1: 1.1, 6: 0.9})  # unless it does not fit
+    assert is_asked(known, APART)  # unless it does not fit
 
 
 @pytest.mark.parametrize("method", ["given", "kept", "claim"])
 def test_a_camera_that_somebody_stated_is_not_divided_by_focals(cameras, method):
     stated = best_of(attempt(photos(6), 0), number=6, views=chain(6), intrinsics=cameras(method=method))
-    assert not is_asked(stated, {1: 1.1, 6: 0.9})
+    assert not is_asked(stated, APART)
 
 
 def test_every_photo_gets_a_guess_of_its_own_that_begins_where_mapping_ended(synthetic, run, cameras, mapped):
@@ -400,7 +404,7 @@ def test_every_photo_gets_a_guess_of_its_own_that_begins_where_mapping_ended(syn
 def judged(cameras):
     """Whether the judge prefers a model to one of 6 photos; `places` are the judgments of the places of both."""
 
-    def make(other, best=None, places=(), own_focals=(), **intrinsics):
+    def make(other, best=None, places=(), apart=(), **intrinsics):
         judgments = dict(zip(("other", "best"), places, strict=False))
         outcomes = [
             best_of(*models, number=9, intrinsics=cameras(**GUESS))
@@ -408,10 +412,10 @@ def judged(cameras):
         ]
         outcomes[0] = replace(outcomes[0], evidence=replace(outcomes[1].evidence, **intrinsics))
         names = dict(zip((one.models for one in outcomes), ("other", "best"), strict=True))
-        focals = {one.models[0].model: dict(own_focals) for one in outcomes[1:] if one.models}
+        divided = {one.models[0].model: dict(apart) for one in outcomes[1:] if one.models}
         mapper = SimpleNamespace(
             judge_places=lambda models: judgments.get(names[models], ([], 0)),
-            find_own_focals=lambda model: focals.get(model, {}),
+            find_cameras=lambda model: divided.get(model, {}),
         )
         return is_better(*outcomes, mapper)
 
@@ -437,11 +441,11 @@ def test_of_models_that_explain_equally_much_the_judge_prefers_more_photos_then_
         assert judged([attempt(photos(7), remaining, 500)], contradicted, intrinsics=each)
 
 
-def test_the_judge_prefers_a_camera_for_each_photo_where_one_clearly_does_not_fit(judged):
-    each, clear = SimpleNamespace(camera_name=lambda image: image.name), {1: 1.1, 6: 0.9}
-    assert judged([attempt(photos(6), 0, 999)], own_focals=clear, intrinsics=each)
+def test_the_judge_prefers_more_cameras_where_one_clearly_does_not_fit(judged):
+    each = SimpleNamespace(camera_name=lambda image: image.name)
+    assert judged([attempt(photos(6), 0, 999)], apart=APART, intrinsics=each)
     assert not judged([attempt(photos(6), 0, 999)], intrinsics=each)
-    assert not judged([attempt(photos(5), 0, 999)], own_focals=clear, intrinsics=each)  # but no photo may go
+    assert not judged([attempt(photos(5), 0, 999)], apart=APART, intrinsics=each)  # but no photo may go
 
 
 def test_the_judge_prefers_places_apart(judged):
@@ -478,10 +482,11 @@ def test_photos_with_two_focals_get_theirs_whatever_pairs_say(two_zooms, run, ca
 
     found = fakes.improve(fakes.best(cameras(), run(), fakes.attempt(zoomed.model)), PER_PHOTO)
 
-    assert trials_of(found) == [("camera-per-photo", True, "with a camera for each photo: 6 photos")]
+    assert trials_of(found) == [("other-cameras", True, "with 2 instead of 1 camera: 6 photos")]
     focals = [found.main.model.cameras[image.camera_id].params[0] for image in posed_images(found.main.model)]
     assert np.allclose(focals, FOCAL * np.repeat([1, factor], 3), rtol=0.02)
-    assert cameras_in(run().workspace.database) == found.cameras == 6
+    assert cameras_in(run().workspace.database) == found.cameras == 2
+    assert [found.evidence.camera_name(photo) for photo in (1, 4)] == ["one", "one #2"]
 
 
 def test_photos_whose_focals_differ_as_by_focusing_keep_their_camera(two_zooms, run, cameras):
@@ -527,14 +532,14 @@ def test_photos_of_a_zoom_are_mapped_with_a_camera_each(run, cameras, mapped, zo
     found = mapped.outcome(cameras(**GUESS), run(), hypotheses=[PER_PHOTO])
     assert asked == [1, 6]
     assert len(found.evidence.intrinsics.cameras) == 6 and cameras_in(run().workspace.database) == 6
-    assert trials_of(found)[1:] == [("camera-per-photo", True, "6 cameras")]
+    assert trials_of(found)[1:] == [("other-cameras", True, "6 cameras")]
     assert found.trials[1].reason == "a shared camera does not fit"
 
 
 def test_photos_of_one_camera_keep_it_and_so_does_the_database(run, cameras, mapped, zoom):
     asked, guess = zoom(right=False), cameras(**GUESS)
     found = mapped.outcome(guess, run(), hypotheses=[replace(PER_PHOTO, reason=lambda *_: "a doubt")])
-    assert asked == [1, 6] and trials_of(found)[-1][:2] == ("camera-per-photo", False)
+    assert asked == [1, 6] and trials_of(found)[-1][:2] == ("other-cameras", False)
     assert found.evidence.intrinsics is guess and cameras_in(run().workspace.database) == 1
 
 
