@@ -253,22 +253,18 @@ def _with_other_focals(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
 
 
 # Other cameras, for a zoom or several devices. Photos of one size share a camera until their pairs contradict that.
-# Pairs of a camera that moves forward, round one point or along a plane never do. The model does: its photos show
-# focal lengths of their own, or, with one focal, it contradicts matches that are right pair by pair.
+# Pairs of a camera that moves forward, round one point or along a plane never do. The photos of a model do: they show
+# focal lengths of their own.
 
 
 def _shared_camera_reason(best: Outcome, mapper: Mapper) -> str:
-    """Return why photos of one size may have other cameras: their focals differ, matches contradict, or many lack."""
+    """Return why photos of one size may have other cameras: their focals differ in the model, or it lacks many."""
     if best.main is None or mapper.run.settings.photos.cameras != "auto":
         return ""
     if _divided(best, mapper):
         return "photos of one size have different focal lengths"
-    # pairs on a plane are not counted as fits
-    photos = max(best.photos, len(photos_with_geometry(best.trusted)))
-    if not OPTIONS.min_photos <= photos <= OPTIONS.max_photos or not _each(best):
-        return ""
-    is_contradicted = best.main.contradicted_share > MAPPING.guessed_contradicted_share
-    return "a shared camera does not fit" if is_contradicted or _focal_reason(best, mapper) else ""
+    few = len(photos_with_geometry(best.trusted)) < OPTIONS.min_photos
+    return "" if few or not _each(best) or not _focal_reason(best, mapper) else "a shared camera does not fit"
 
 
 def _divided(best: Outcome, mapper: Mapper) -> dict[int, tuple[int, float]]:
