@@ -30,11 +30,11 @@ from sfm_app.mapping.attempt import (
 )
 from sfm_app.mapping.feature_retry import find_finer_evidence, lost_photos
 from sfm_app.mapping.look_alikes import OVERLAPS, with_false_joins
-from sfm_app.mapping.passes import MAPPERS, Mapper, Mappers, Outcome, Trial, guess_again, guessed_intrinsics
+from sfm_app.mapping.passes import MAPPERS, Mapper, Mappers, Outcome, Trial, guessed_intrinsics
 from sfm_app.mapping.splits import split_attempt
 from sfm_app.runtime.context import RunContext
 from sfm_app.settings import FIRST_TRIAL, HYPOTHESES, HypothesisName
-from sfm_app.types import Evidence, Intrinsics
+from sfm_app.types import Calibration, Evidence, Intrinsics
 
 
 class OPTIONS:
@@ -261,10 +261,9 @@ def _shared_camera_reason(best: Outcome, mapper: Mapper) -> str:
     """Return why photos of one size may have other cameras: their focals differ in the model, or it lacks many."""
     if best.main is None or mapper.run.settings.photos.cameras != "auto":
         return ""
-    if _divided(best, mapper):
-        return "photos of one size have different focal lengths"
-    few = len(photos_with_geometry(best.trusted)) < OPTIONS.min_photos
-    return "" if few or not _each(best) or not _focal_reason(best, mapper) else "a shared camera does not fit"
+    enough = len(photos_with_geometry(best.trusted)) >= OPTIONS.min_photos
+    is_doubtful = enough and _each(best) and _focal_reason(best, mapper)
+    return "a shared camera does not fit" if _divided(best, mapper) or is_doubtful else ""
 
 
 def _divided(best: Outcome, mapper: Mapper) -> dict[int, tuple[int, float]]:
@@ -308,19 +307,20 @@ def _with_other_cameras(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
 
 
 def _regroup(best: Outcome, found: Mapping[int, tuple[int, float]]) -> Intrinsics:
-    """Give photos cameras by number: guesses of the focals of the model, times a factor."""
+    """Give photos cameras by number, as guesses: those of the model, with focals times a factor."""
     evidence, shared = best.evidence, best.evidence.intrinsics
-    focals = {} if best.main is None else cameras_by_photo(best.main.model)
-    focal_of = {evidence.camera_name(k): float(K[0, 0] * K[1, 1]) ** 0.5 for k, (K, *_) in focals.items()}
+    learned = {} if best.main is None else cameras_by_photo(best.main.model)
+    K_of = {evidence.camera_name(photo): K for photo, (K, *_) in learned.items()}
     cameras, camera_of, names = dict(shared.cameras), dict(shared.camera_of), dict[int, str]()
     for photo in sorted(found, key=lambda photo: evidence.matches.images[photo].name):
         (number, factor), name = found[photo], evidence.camera_name(photo)
         if number not in names:
             free = (other for k in count(2) if (other := f"{name} #{k}") not in cameras)
             names[number] = name if name not in names.values() else next(free)
-            focal_px = factor * focal_of.get(name, shared.cameras[name].focal_px)
-            reason = "photos of its size may be of other cameras"
-            cameras[names[number]] = guess_again(shared.cameras[name], focal_px, reason)
+            camera, reason = shared.cameras[name], "photos of its size may be of other cameras"
+            K = K_of.get(name, camera.K) * [[factor, 1.0, 1.0], [1.0, factor, 1.0], [1.0, 1.0, 1.0]]
+            lens = camera.projection, camera.distortion
+            cameras[names[number]] = Calibration(K, camera.width, camera.height, "guess", False, reason, *lens)
         camera_of[evidence.matches.images[photo].name] = names[number]
     return replace(shared, cameras=cameras, camera_of=camera_of)
 

@@ -228,7 +228,7 @@ def test_uncertain_focal_lengths_of_most_photos_are_a_warning():
 
 def test_a_camera_for_each_photo_is_named_where_it_was_tried():
     tried = trial("other-cameras", "a shared camera does not fit", photos=(5, 5))
-    start = "a camera for each photo (a zoom, or several devices), because a shared camera does not fit:"
+    start = "other cameras for photos of one size (a zoom, or several devices), because a shared camera does not fit:"
     assert f"{start} it is better\n" in describe(hypotheses=[tried])[0]
     assert f"{start} it is no better\n" in describe(hypotheses=[tried | {"accepted": False}])[0]
     assert "each" not in describe()[0]
