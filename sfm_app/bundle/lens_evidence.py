@@ -287,16 +287,18 @@ def _shorten_step(before: FloatArray, after: FloatArray, camera: int, priors: le
     return next((one for one in halves if not priors.folds(camera, one)), before)
 
 
-def divide_by_focal(bundle: Bundle, priors: lens_parts.LensPriors) -> tuple[IndexArray, FloatArray]:
-    """Divide the photos of each camera where focal lengths of their own explain them much better.
+def divide_by_focal(bundle: Bundle, priors: lens_parts.LensPriors) -> IndexArray:
+    """Return (I,) the number of each photo's camera: divided where other focal lengths explain its photos much better.
 
     They are of two devices, or each of its own: a zoom. Independent noise decides which, as it favors the second; the
-    division must pay in spite of the usual misfit. Return (I,) the number of each photo's camera, and (I,) by how much
-    its log f changes.
+    division must pay in spite of the usual misfit.
     """
     H, g = _focal_likelihood(bundle, priors)
-    alone = _weigh_groups(H, g, np.arange(len(g)))[1]
-    numbers = bundle.camera.copy()
+
+    def weigh(numbers: IndexArray, misfit: float) -> tuple[float, FloatArray]:
+        return _weigh_groups(H / misfit**2, g / misfit**2, numbers)
+
+    alone, numbers = weigh(np.arange(len(g)), MISFIT)[1], bundle.camera.copy()
     for camera in range(len(bundle.params)):
         members = np.flatnonzero(numbers == camera)
         if np.ptp(alone[members]) < OPTIONS.least_change:
@@ -306,28 +308,26 @@ def divide_by_focal(bundle: Bundle, priors: lens_parts.LensPriors) -> tuple[Inde
         order = members[np.argsort(alone[members], kind="stable")]
         for cut, division in enumerate(divisions[1:], start=1):
             division[order[cut:]] = numbers.max() + 1
-        best = max(divisions, key=lambda one: _weigh_groups(MISFIT**2 * H, MISFIT**2 * g, one)[0])
-        if _weigh_groups(H, g, best)[0] >= _weigh_groups(H, g, numbers)[0] + OPTIONS.divide_log_odds:
+        best = max(divisions, key=lambda one: weigh(one, 1.0)[0])
+        if weigh(best, MISFIT)[0] >= weigh(numbers, MISFIT)[0] + OPTIONS.divide_log_odds:
             numbers = best
-    return numbers, _weigh_groups(H, g, numbers)[1]
+    return numbers
 
 
 def _focal_likelihood(bundle: Bundle, priors: lens_parts.LensPriors) -> tuple[FloatArray, FloatArray]:
-    """Return H (I, I) and g (I,) of changes of each photo's log f; cameras, poses and points follow."""
+    """Return H (I, I) and g (I,) of changes of each photo's log f, for noise alone; all else follows."""
     photos, shared = len(bundle.R), bundle.params.size
     rows = np.arange(photos)
     own = replace(bundle, params=bundle.params[bundle.camera], camera=rows, family=bundle.family[bundle.camera])
     reduced = reduce(replace(own, fixed=None), bundle_scale(bundle))
-    T, weight = _logarithm_jacobian(own.params), evidence_weight(reduced.noise_px)
+    T = _logarithm_jacobian(own.params)
     # a parameter of a camera is that of all its photos; their own focals follow
     column = np.concatenate([(CAMERA * bundle.camera[:, None] + np.arange(CAMERA)).ravel(), shared + rows])
     row = np.concatenate([np.arange(own.params.size), CAMERA * rows + lens_parts.LOG_FOCAL])
     H, g = np.zeros((shared + photos, shared + photos)), np.zeros(shared + photos)
-    np.add.at(H, (column[:, None], column), weight * (T.T @ (reduced.H @ T))[row[:, None], row])
-    np.add.at(g, column, weight * (T.T @ reduced.g)[row])
-    precision = priors.precision(np.ones((len(bundle.params), lens_parts.COUNT), np.bool_)).ravel()
-    H[range(shared), range(shared)] += precision
-    g[:shared] += precision * priors.prior_offsets(bundle.params).ravel()
+    np.add.at(H, (column[:, None], column), (T.T @ (reduced.H @ T))[row[:, None], row] / reduced.noise_px**2)
+    np.add.at(g, column, (T.T @ reduced.g)[row] / reduced.noise_px**2)
+    H[range(shared), range(shared)] += priors.precision(np.ones_like(priors.estimated)).ravel()
     follow = solve_positive(H[:shared, :shared], np.column_stack([H[:shared, shared:], g[:shared]]))
     across = _multiply(H[shared:, :shared], follow)
     return H[shared:, shared:] - across[:, :-1], g[shared:] - across[:, -1]

@@ -376,14 +376,13 @@ def _observed_reach(bundle: Bundle, row: int) -> float:
     return float(np.quantile(np.hypot(*offsets.T), OPTIONS.outermost)) if len(x) else 0.0
 
 
-def find_cameras(model: Reconstruction) -> dict[int, tuple[int, float]]:
-    """Return by photo a number of its camera and a factor on its focal, where photos of one camera clearly differ."""
+def find_cameras(model: Reconstruction) -> dict[int, int]:
+    """Return a number of the camera of each photo whose camera others share, but clearly not all with one focal."""
     ids, bundle = read_bundle(model)
-    numbers, changes = divide_by_focal(bundle, lens_priors(model, ids, bundle))
-    parts = Counter(zip(bundle.camera.tolist(), numbers.tolist(), strict=True))
-    divided = [camera for camera, count in Counter(camera for camera, _ in parts).items() if count > 1]
-    found = zip(sorted(model.reg_image_ids()), numbers.tolist(), np.exp(changes).tolist(), bundle.camera, strict=True)
-    return {photo: (number, factor) for photo, number, factor, camera in found if camera in divided}
+    numbers = divide_by_focal(bundle, lens_priors(model, ids, bundle))
+    divided = set(bundle.camera[numbers != bundle.camera].tolist())
+    photos = zip(sorted(model.reg_image_ids()), numbers.tolist(), bundle.camera.tolist(), strict=True)
+    return {photo: number for photo, number, camera in photos if camera in divided}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

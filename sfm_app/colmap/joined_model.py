@@ -75,19 +75,11 @@ def write_placed(database: Path, placed: PlacedPhotos) -> Reconstruction:
     return model
 
 
-def divide_cameras(model: Reconstruction, database: Path, factors: Mapping[int, float]) -> Reconstruction:
-    """Return the model with the cameras that a database names for its photos, adjusted with their focals.
-
-    `factors` on the focal lengths, by photo, are where the adjustment begins.
-    """
-    placed = placed_photos(model)
-    for photo, factor in factors.items():
-        camera = placed.cameras[photo]
-        for place in camera.focal_length_idxs():
-            camera.params[place] *= factor
-    divided = write_placed(database, placed)
-    adjust_joined(divided, database, sorted(photos_per_camera(divided)))
-    return divided
+def with_cameras_of(database: Path, model: Reconstruction) -> Reconstruction:
+    """Return a model with the cameras that a database names for its photos, adjusted with their focals."""
+    found = write_placed(database, placed_photos(model))
+    adjust_joined(found, database, sorted(photos_per_camera(found)))
+    return found
 
 
 def _write_cameras(model: Reconstruction, placed: PlacedPhotos) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import write_match_graph
-from sfm_app.colmap.joined_model import divide_cameras
+from sfm_app.colmap.joined_model import with_cameras_of
 from sfm_app.colmap.model import cameras_by_photo, posed_photo_ids
 from sfm_app.errors import BackendError
 from sfm_app.mapping.attempt import (
@@ -266,27 +266,24 @@ def _shared_camera_reason(best: Outcome, mapper: Mapper) -> str:
     return "a shared camera does not fit" if _divided(best, mapper) or is_doubtful else ""
 
 
-def _divided(best: Outcome, mapper: Mapper) -> dict[int, tuple[int, float]]:
-    """Return the number of the camera of each photo whose shared camera clearly does not fit, and its focal's factor.
+def _divided(best: Outcome, mapper: Mapper) -> dict[int, int]:
+    """Return a number of the camera of each photo whose shared camera clearly does not fit.
 
     Cameras that somebody has stated stay. In large models, this costs more than it promises.
     """
     if best.main is None or not OPTIONS.min_photos <= best.photos <= OPTIONS.max_photos:
         return {}
-    found = mapper.find_cameras(best.main.model)
-    stated = {photo for photo in found for one in (best.evidence.camera(photo),) if one.is_given or one.is_claimed}
-    return {photo: camera for photo, camera in found.items() if photo not in stated}
-
-
-def _each(best: Outcome) -> dict[int, tuple[int, float]]:
-    """Return a number for the camera of each photo, where pairs do not determine a shared one, and the factor 1."""
-    evidence = best.evidence
-    shared = Counter(map(evidence.camera_name, evidence.matches.images))
-    return {
-        photo: (photo, 1.0)
-        for photo in evidence.matches.images
-        if shared[evidence.camera_name(photo)] > 1 and not evidence.camera(photo).identifiable
+    found = {
+        photo: (best.evidence.camera(photo), number) for photo, number in mapper.find_cameras(best.main.model).items()
     }
+    return {photo: number for photo, (shared, number) in found.items() if not (shared.is_given or shared.is_claimed)}
+
+
+def _each(best: Outcome) -> dict[int, int]:
+    """Return a number of the camera of each photo that shares one."""
+    photos, name_of = best.evidence.matches.images, best.evidence.camera_name
+    sharing = Counter(map(name_of, photos))
+    return {photo: photo for photo in photos if sharing[name_of(photo)] > 1}
 
 
 def _with_other_cameras(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
@@ -298,29 +295,27 @@ def _with_other_cameras(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
     other = replace(best, evidence=replace(best.evidence, intrinsics=_regroup(best, divided)), trials=())
     mapper.write(other)
     with translate_errors("giving photos other cameras"):
-        factors = {photo: factor for photo, (_, factor) in divided.items()}
-        model = divide_cameras(best.main.model, other.run.workspace.database, factors)
+        model = with_cameras_of(other.run.workspace.database, best.main.model)
     how = f"with {other.cameras} instead of {best.cameras} camera{'s' if best.cameras > 1 else ''}"
     attempt = judge_model(other.trusted, best.main.mapper, how, model, mapper.run)
     if isinstance(attempt, Attempt):
         yield replace(other, models=(attempt, *best.models[1:]), notes=(attempt.note,))
 
 
-def _regroup(best: Outcome, found: Mapping[int, tuple[int, float]]) -> Intrinsics:
-    """Give photos cameras by number, as guesses: those of the model, with focals times a factor."""
+def _regroup(best: Outcome, numbers: Mapping[int, int]) -> Intrinsics:
+    """Give photos cameras by number, as guesses that begin where mapping ended."""
     evidence, shared = best.evidence, best.evidence.intrinsics
     learned = {} if best.main is None else cameras_by_photo(best.main.model)
     K_of = {evidence.camera_name(photo): K for photo, (K, *_) in learned.items()}
     cameras, camera_of, names = dict(shared.cameras), dict(shared.camera_of), dict[int, str]()
-    for photo in sorted(found, key=lambda photo: evidence.matches.images[photo].name):
-        (number, factor), name = found[photo], evidence.camera_name(photo)
+    for photo in sorted(numbers, key=lambda photo: evidence.matches.images[photo].name):
+        number, name = numbers[photo], evidence.camera_name(photo)
         if number not in names:
             free = (other for k in count(2) if (other := f"{name} #{k}") not in cameras)
             names[number] = name if name not in names.values() else next(free)
             camera, reason = shared.cameras[name], "photos of its size may be of other cameras"
-            K = K_of.get(name, camera.K) * [[factor, 1.0, 1.0], [1.0, factor, 1.0], [1.0, 1.0, 1.0]]
-            lens = camera.projection, camera.distortion
-            cameras[names[number]] = Calibration(K, camera.width, camera.height, "guess", False, reason, *lens)
+            size, lens = (camera.width, camera.height), (camera.projection, camera.distortion)
+            cameras[names[number]] = Calibration(K_of.get(name, camera.K), *size, "guess", False, reason, *lens)
         camera_of[evidence.matches.images[photo].name] = names[number]
     return replace(shared, cameras=cameras, camera_of=camera_of)
 

@@ -257,7 +257,7 @@ class Mappers:
     map_in_parts: Callable[..., tuple[list[MappingResult], tuple[LookAlikes, ...]]] = map_in_parts
     map_rival: Callable[[Evidence, RunContext], Attempt | NoModel] = map_rival
     judge_places: Callable[[Sequence[Attempt]], tuple[list[LookAlikes], int]] = judge_places
-    find_cameras: Callable[[Reconstruction], dict[int, tuple[int, float]]] = find_cameras
+    find_cameras: Callable[[Reconstruction], dict[int, int]] = find_cameras
 
 
 MAPPERS = Mappers()
