@@ -211,9 +211,8 @@ def publish_maps(dense_dir: Path, view: View) -> None:
 
 
 def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:
-    """Remove the photometric and closed maps and the proposals of all views."""
+    """Remove the photometric and closed maps of all views."""
     for view in views:
-        _map_path(dense_dir, DEPTHS, view, "proposed").unlink(missing_ok=True)
         _map_path(dense_dir, DEPTHS, view, "closed").unlink(missing_ok=True)
         for scaled in (view, *(view.halve(level) for level in range(1, MOST_LEVELS))):
             for folder in (DEPTHS, NORMALS, CONFIDENCES):

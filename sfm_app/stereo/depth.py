@@ -116,15 +116,12 @@ def _merge(depths: NDArray[np.float32], parallaxes: NDArray[np.float32], toleran
 
 
 def count_maps(
-    view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], low: float, high: float = np.inf
+    view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], tolerance: float
 ) -> NDArray[np.uint8]:
-    """Count the other depth maps, (H, W), with `low` to `high` times the depth that a point of a view has there.
-
-    Around 1, they confirm the depth (H, W) of the view, 0 where unknown; beyond it, they contradict.
-    """
+    """Count the other depth maps, (H, W), that confirm a depth (H, W) of a view, 0 where unknown, within a share."""
     count = np.zeros(depth.shape, np.uint8)
     for other, other_depth in others:
-        _count(depth, other_depth, view.projection_into(other), (low, high), view.sample_px, count)
+        _count(depth, other_depth, view.projection_into(other), tolerance, view.sample_px, count)
     return count
 
 
@@ -147,7 +144,7 @@ def _count(
     depth: DepthArray,
     other_depth: DepthArray,
     P: FloatArray,
-    limits: tuple[float, float],
+    tolerance: float,
     sample_px: float,
     count: NDArray[np.uint8],
 ) -> None:
@@ -164,7 +161,11 @@ def _count(
             u = (z * (P[0, 0] * x + P[0, 1] * y + P[0, 2]) + P[0, 3]) / w
             v = (z * (P[1, 0] * x + P[1, 1] * y + P[1, 2]) + P[1, 3]) / w
             j, i = int(np.floor(u - sample_px + 0.5)), int(np.floor(v - sample_px + 0.5))
-            if 0 <= i < height and 0 <= j < width and limits[0] * w <= other_depth[i, j] <= limits[1] * w:
+            if (
+                0 <= i < height
+                and 0 <= j < width
+                and (1.0 - tolerance) * w <= other_depth[i, j] <= (1.0 + tolerance) * w
+            ):
                 count[row, col] += 1
 
 
@@ -184,7 +185,7 @@ def confirm_depths(
     """
     if not others:
         return Rejected("no other depth map to compare with")
-    agreeing = count_maps(view, estimate.depth, others, 1.0 - tolerance, 1.0 + tolerance)
+    agreeing = count_maps(view, estimate.depth, others, tolerance)
     confidence = estimate.confidence
     least, more = (min(need, len(others)) for need in (min_agreeing, min_agreeing + 1))
     needed = np.where(confidence < OPTIONS.unsure_correlation, more, least)

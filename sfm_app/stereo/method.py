@@ -10,7 +10,6 @@ from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.settings import AS_NEEDED, DepthSettings
 from sfm_app.stereo.depth import OPTIONS as DEPTH_OPTIONS
 from sfm_app.stereo.depth import confirm_depths, match_depths
-from sfm_app.stereo.plane_proposals import add_depths, agreed_proposals, propose_planes
 from sfm_app.stereo.sky import PhotoAreas, blank_areas, compare_areas, near_pixels, possible_skies, to_cells
 from sfm_app.stereo.view import DepthEstimate, DepthMap, DepthStore, DepthTask, GrayImage, View
 from sfm_app.tasks import ParallelMap, Shared, Task
@@ -20,11 +19,10 @@ from sfm_app.types.arrays import BoolArray, DepthArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps:
-    """The three steps of the method for one photo."""
+    """The two steps of the method for one photo."""
 
     match: Callable[..., DepthEstimate | Rejected] = match_depths
     confirm: Callable[..., DepthMap | Rejected] = confirm_depths
-    propose: Callable[..., DepthArray] = propose_planes
 
 
 STEPS = Steps()
@@ -68,9 +66,6 @@ def make_depth_maps_on_cpu(task: DepthTask, steps: Steps = STEPS) -> list[Reject
         for level in range(1, len(inputs.levels)):
             task.map(Task(_match, shared, level), everything, "matching depths in smaller photos")
         task.map(Task(_fill, shared), everything, "filling gaps in depth maps")
-        mapped = [index for index in everything if store.has(task.views[index], "geometric")]
-        task.map(Task(_propose, shared), mapped, "fitting planes to plain areas")
-        task.map(Task(_fill_plain_areas, shared), mapped, "filling plain areas")
     has_map = [store.has(view, "geometric") for view in task.views]
     return [None if known else reason for known, reason in zip(has_map, rejected, strict=True)]
 
@@ -156,38 +151,6 @@ def _confirm_level(task: _Inputs, level: int, index: int) -> DepthMap | Rejected
         return task.steps.confirm(view, photo, estimate, others, task.options.min_agreeing, task.tolerance(level))
     except FAILURES as err:
         return Rejected(f"the computation failed: {error_reason(err)}")
-
-
-def _propose(inputs: Shared[_Inputs], index: int) -> None:
-    """Keep proposals for the plain areas of a photo outside a possible sky; none if the computation fails."""
-    task = inputs.value
-    view, store = task.levels[0][index], task.store
-    if not store.has(view, "proposed"):
-        photo, depth = store.photo(view), store.read_depth(view, "geometric")
-        try:
-            proposed = task.steps.propose(depth, photo, task.tolerance(1))
-        except FAILURES:  # plain areas stay open
-            proposed = np.zeros_like(depth)
-        proposed[task.closed_pixels(view)] = 0
-        store.write_depth(view, proposed, "proposed")
-
-
-def _fill_plain_areas(inputs: Shared[_Inputs], index: int) -> None:
-    """Fill the plain areas of a photo with planes that other photos propose, too; a repetition changes nothing."""
-    task = inputs.value
-    views, store = task.levels[0], task.store
-    view, near = views[index], [views[other] for other in task.ranked[index]]
-    proposed = store.read_depth(view, "proposed")
-    if not proposed.any():
-        return
-    maps = store.read_maps(view)
-    others = [
-        (other, store.read_depth(other, "geometric"), store.read_depth(other, "proposed"))
-        for other in near
-        if store.has(other, "proposed")
-    ]
-    agreed = agreed_proposals(view, (maps.depth, proposed), others, task.tolerance(1))
-    store.write_maps(view, add_depths(maps, agreed, view))
 
 
 # Coarser depth maps fill gaps of finer ones.

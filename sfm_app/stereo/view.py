@@ -16,9 +16,9 @@ from sfm_app.types.arrays import DepthArray, FloatArray, IndexArray
 
 GrayImage = NDArray[np.uint8]
 """(H, W)."""
-Kind = Literal["photometric", "geometric", "closed", "proposed", "final"]
-"""COLMAP's names for a depth map before and after the check against the other photos; proposals for plain areas; and
-maps with sharp outlines before they replace the geometric ones."""
+Kind = Literal["photometric", "geometric", "closed", "final"]
+"""COLMAP's names for a depth map before and after the check against the other photos; closed cells; and maps with sharp
+outlines before they replace the geometric ones."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,8 +77,7 @@ class DepthEstimate:
 class DepthStore(Protocol):
     """Reads photos and keeps maps; a map appears complete or not at all.
 
-    Estimates are photometric, maps are geometric; a proposal has depths in plain areas, 0 elsewhere. Of a closed map,
-    the cells that are not 0 are never filled.
+    Estimates are photometric, maps are geometric. Of a closed map, the cells that are not 0 are never filled.
     """
 
     def photo(self, view: View, /) -> GrayImage:
