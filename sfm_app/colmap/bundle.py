@@ -379,7 +379,11 @@ def _observed_reach(bundle: Bundle, row: int) -> float:
 def find_cameras(model: Reconstruction) -> dict[int, int]:
     """Return a number of the camera of each photo whose camera others share, but clearly not all with one focal."""
     ids, bundle = read_bundle(model)
-    numbers = divide_by_focal(bundle, lens_priors(model, ids, bundle))
+    try:
+        numbers = divide_by_focal(bundle, lens_priors(model, ids, bundle))
+    except FAILURES as err:
+        logger.info("the focals of photos could not be compared", exc_info=err)
+        return {}
     divided = set(bundle.camera[numbers != bundle.camera].tolist())
     photos = zip(sorted(model.reg_image_ids()), numbers.tolist(), bundle.camera.tolist(), strict=True)
     return {photo: number for photo, number, camera in photos if camera in divided}

@@ -11,7 +11,7 @@ from sfm_app.camera.models import calibration_from_model, camera_matrix
 from sfm_app.camera.rows import CAMERA, FISHEYE, FX, K1, K2, K3, P1, PANORAMA
 from sfm_app.colmap import bundle
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.bundle import adjust, adjust_or_keep, read_bundle, solve, write_camera
+from sfm_app.colmap.bundle import adjust, adjust_or_keep, find_cameras, read_bundle, solve, write_camera
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import camera_family, read_camera
 from sfm_app.errors import BackendError, NumericalError
@@ -366,6 +366,7 @@ def test_a_camera_without_a_focal_length_stays_as_mapping_left_it(mapped):
     model, database = mapped(start=(np.nan, 500.0, 400.0, 0.0))
     found = adjust_or_keep(model, database)
     assert found.failure == "a camera has no focal length" and found.model is model
+    assert find_cameras(model) == {}
 
 
 @pytest.mark.parametrize(
