@@ -51,7 +51,7 @@ class OPTIONS:
     min_photos: int = 5
     """With fewer photos, a camera per photo fits almost anything. Chosen by hand."""
     max_photos: int = 100
-    """With more photos, a pass costs more than it promises. Chosen by hand."""
+    """Photos above which their focals are not compared: it costs more than it promises. Chosen by hand."""
     max_remaining_share: float = 0.5
     """Share of the contradictions that may remain with more cameras. Chosen on `benchmarks.trouble`."""
 
