@@ -327,6 +327,7 @@ def main() -> None:
     with ThreadPoolExecutor(args.jobs) as pool:
         for of_folder in pool.map(partial(run_folder, args=args), seeds):
             rows += of_folder
-            found = document("trouble", ABOUT, {"jobs": args.jobs, "workers": args.workers}, {"seeds": seeds}, rows)
+            kept = [{name: value for name, value in row.items() if name != "trials"} for row in rows]
+            found = document("trouble", ABOUT, {"jobs": args.jobs, "workers": args.workers}, {"seeds": seeds}, kept)
             write(args.results, args.name, found, page(rows))
     print(page(rows))
