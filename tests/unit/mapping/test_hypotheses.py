@@ -17,7 +17,7 @@ from sfm_app.mapping.hypotheses import ALL, OPTIONS, is_better, learned_intrinsi
 from sfm_app.mapping.passes import Mapper, Mappers, Outcome
 from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.settings import HYPOTHESES, HypothesisName, Settings
-from sfm_app.types import Evidence, LookAlikes, MatchedImage, MatchGraph, PoseGraph, ViewGraph
+from sfm_app.types import Evidence, Intrinsics, LookAlikes, MatchedImage, MatchGraph, PoseGraph, ViewGraph
 from tests.unit.mapping.fakes import (
     AGAINST,
     EMPTY,
@@ -350,6 +350,10 @@ def test_it_is_asked_where_one_guess_places_few_photos_that_nobody_grouped(camer
     best = best_of(attempt(photos(placed), 0), number=number, views=chain(number), intrinsics=cameras(**GUESS))
     assert is_asked(best) is asked
     assert not is_asked(best, photos={"cameras": "single"})
+    (guess,) = best.evidence.intrinsics.cameras.values()
+    each = {f"{k}.jpg": f"one #{k}" for k in range(1, number + 1)}
+    alone = Intrinsics(dict.fromkeys(each.values(), guess), each)
+    assert not is_asked(replace(best, evidence=replace(best.evidence, intrinsics=alone)))
 
 
 @pytest.mark.parametrize(("number", "asked"), [(OPTIONS.min_photos - 1, False), (6, True), (101, False)])
