@@ -14,7 +14,7 @@ from sfm_app.bundle import lens_parts
 from sfm_app.bundle.normal_equations import Bundle, ReducedSystem, bundle_scale, reduce
 from sfm_app.camera.projection import angle_limit, radius_at
 from sfm_app.camera.rows import CAMERA, CX, CY, FISHEYE, FX, FY, K1, K2, K3, K4, PANORAMA, PERSPECTIVE
-from sfm_app.geometry.least_squares import cavity, inverse_of_positive, posteriors, solve_positive
+from sfm_app.geometry.least_squares import NormalPriors, cavity, inverse_of_positive, posteriors, solve_positive
 from sfm_app.types.arrays import BoolArray, FloatArray, IndexArray
 
 if TYPE_CHECKING:
@@ -336,13 +336,12 @@ def _focal_likelihood(bundle: Bundle, priors: lens_parts.LensPriors) -> tuple[Fl
 def _weigh_groups(H: FloatArray, g: FloatArray, numbers: IndexArray) -> tuple[float, FloatArray]:
     """Return the log-evidence of one change of log f per group, up to a constant, and (I,) the most probable ones."""
     _, group = np.unique(numbers, return_inverse=True)
-    count, precision = int(group.max()) + 1, OPTIONS.own_focal**-2.0
-    S, s = np.zeros((count, count)), np.asarray(np.bincount(group, g), np.float64)
+    count = int(group.max()) + 1
+    S = np.zeros((count, count))
     np.add.at(S, (group[:, None], group), H)
-    S[range(count), range(count)] += precision
-    changes = solve_positive(S, s[:, None])[:, 0]
-    log_evidence = 0.5 * (np.sum(s * changes) - np.linalg.slogdet(S)[1] + count * np.log(precision))
-    return float(log_evidence), changes[group]
+    prior = NormalPriors(np.full((1, count), OPTIONS.own_focal**-2.0), np.zeros((1, count)), np.zeros(1))
+    found = posteriors(S, np.asarray(np.bincount(group, g), np.float64), prior)
+    return float(found.log_evidence[0]), found.steps[0, group]
 
 
 def suggests_other_family(params: FloatArray, family: int, reach: float, best: LensChoice, folding: bool) -> bool:

@@ -273,10 +273,8 @@ def _divided(best: Outcome, mapper: Mapper) -> dict[int, int]:
     """
     if best.main is None or not OPTIONS.min_photos <= best.photos <= OPTIONS.max_photos:
         return {}
-    found = {
-        photo: (best.evidence.camera(photo), number) for photo, number in mapper.find_cameras(best.main.model).items()
-    }
-    return {photo: number for photo, (shared, number) in found.items() if not (shared.is_given or shared.is_claimed)}
+    shared, numbers = best.evidence.camera, mapper.find_cameras(best.main.model)
+    return {one: numbers[one] for one in numbers if not (shared(one).is_given or shared(one).is_claimed)}
 
 
 def _each(best: Outcome) -> dict[int, int]:
