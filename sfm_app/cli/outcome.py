@@ -132,7 +132,8 @@ def _accuracy_lines(run: Run) -> Iterator[str]:
 
 def _camera_lines(run: Run) -> Iterator[str]:
     """Yield focal length and field of view of each camera, after bundle adjustment if there is one."""
-    cameras = run.calibration.cameras if run.calibration is not None else {}
+    divided = run.scene.camera_of if run.scene is not None else {}
+    cameras = run.calibration.divided_as(divided) if run.calibration is not None else {}
     if run.scene is not None and run.scene.cameras:  # without those whose photos are all missing
         cameras = {name: calibration for name, calibration in cameras.items() if name in run.scene.cameras}
     for name, calibration in list(cameras.items())[:LINES_SHOWN]:

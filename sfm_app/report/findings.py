@@ -176,7 +176,7 @@ def camera_tables(contents: RunContents) -> list[CameraTable]:
     if intrinsics is None:
         return []
     tables = []
-    for name, camera in intrinsics.cameras.items():
+    for name, camera in intrinsics.divided_as(scene.camera_of if scene is not None else {}).items():
         after = scene.cameras.get(name) if scene is not None else None
         rows = [
             (

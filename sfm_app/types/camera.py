@@ -135,6 +135,14 @@ class Intrinsics:
         """Return the camera that took a photo."""
         return self.cameras[self.camera_name(photo)]
 
+    def divided_as(self, camera_of: Mapping[str, str]) -> dict[str, Calibration]:
+        """Return all cameras by name, also those that mapping made of one: `camera_of` has their names by photo."""
+        found = dict(self.cameras)
+        for photo, name in camera_of.items():
+            if photo in self.camera_of:
+                found.setdefault(name, self.cameras[self.camera_of[photo]])
+        return found
+
     @property
     def main(self) -> Calibration:
         """The camera that took the most photos."""

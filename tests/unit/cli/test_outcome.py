@@ -138,6 +138,19 @@ def test_a_camera_of_missing_photos_is_not_shown(finished):
     assert "camera      focal 501.0" in text and "0 usable pairs" not in text
 
 
+def test_both_cameras_are_shown_that_mapping_made_of_one(finished):
+    scene = replace(
+        finished.scene, cameras={"one": REFINED, "one #2": REFINED}, camera_of={"a.jpg": "one", "b.jpg": "one #2"}
+    )
+    calibration = Intrinsics({"one": GUESS}, dict.fromkeys(("a.jpg", "b.jpg"), "one"))
+    lines = outcome_lines(replace(finished, calibration=calibration, scene=scene), 250.0)
+    assert [line[:26].strip() for line in lines if line.startswith("camera ")] == [
+        "camera      one: focal 501",
+        "camera      one #2: focal",
+    ]
+    assert sum("pairs of photos do not determine it" in line for line in lines) == 2
+
+
 def test_only_the_first_cameras_are_shown(finished):
     cameras = Intrinsics({f"camera {k}": KNOWN for k in range(5)})
     lines = outcome_lines(replace(finished, calibration=cameras, scene=None), 250.0)

@@ -15,6 +15,7 @@ from sfm_app.report.findings import (
     ALL_PIXELS,
     LARGEST_PX,
     SMALLEST_PX,
+    camera_tables,
     changed_settings,
     correlation_table,
     correlation_text,
@@ -27,7 +28,7 @@ from sfm_app.report.page import script_data, three_script
 from sfm_app.report.scene_view import LIGHT_PAGE_PX, lighten
 from sfm_app.report.text import duration_text
 from sfm_app.settings import Settings
-from sfm_app.types import Calibration, CameraModel
+from sfm_app.types import Calibration, CameraModel, Intrinsics
 
 
 def test_three_js_comes_from_an_installed_package_and_ends_before_the_page_that_it_was_in():
@@ -109,6 +110,21 @@ def test_a_scene_states_how_sure_its_cameras_are():
     intrinsics = SimpleNamespace(cameras={"a": guess, "b": guess})
     assert len(unknown_cameras(SimpleNamespace(intrinsics=intrinsics, scene=None))) == 2
     assert unknown_cameras(SimpleNamespace(intrinsics=intrinsics, scene=SimpleNamespace())) == []
+
+
+def test_cameras_that_mapping_made_of_one_have_a_table_each():
+    K = np.diag([768.0, 768.0, 1.0])
+    intrinsics = Intrinsics({"a": Calibration(K, 640, 480, "guess", identifiable=False)}, {"1.jpg": "a", "2.jpg": "a"})
+    refined = {
+        name: CameraModel("OPENCV", (focal, focal, 320.0, 240.0, *[0.0] * 4), np.diag([focal, focal, 1.0]), 640, 480)
+        for name, focal in (("a", 700.0), ("a #2", 800.0))
+    }
+    scene = SimpleNamespace(cameras=refined, camera_of={"1.jpg": "a", "2.jpg": "a #2"})
+    tables = camera_tables(SimpleNamespace(intrinsics=intrinsics, scene=scene, counts=lambda _: {}))
+    assert [(table.name, *table.rows[0]) for table in tables] == [
+        ("a", "fx", "768.0", "700.0"),
+        ("a #2", "fx", "768.0", "800.0"),
+    ]
 
 
 @pytest.mark.parametrize(("unusable", "more"), [(0, ""), (2, "and 2 unusable")])
