@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.stereo.patch_match import NO_MATCH, fit_planes, improve_planes, plane_normals
+from sfm_app.stereo.patch_match import NO_MATCH, fit_planes, match_planes, plane_normals
 from sfm_app.stereo.plain_areas import enclosed_pixels, fill_planar_areas, plain_walls, surfaceless_areas
 from sfm_app.stereo.rectify import depths_from_disparities, disparities, rectify
 from sfm_app.stereo.view import DepthEstimate, DepthMap, GrayImage, View
@@ -37,20 +37,18 @@ OPTIONS = DepthOptions()
 
 
 def match_depths(
-    view: View, candidates: Sequence[View], load: Callable[[View], GrayImage], count: int, tolerance: float
+    view: View, candidates: Sequence[View], load: Callable[[View], GrayImage], count: int
 ) -> DepthEstimate | Rejected:
-    """Match a photo with the first `count` candidates that can be rectified with it, and combine the results.
+    """Match a photo with the first `count` candidates that can be rectified with it; the best come first.
 
-    Semi-global matching with each neighbor gives depths; the merged depths initialize PatchMatch with all neighbors.
-
-    The best candidates come first. `load` returns the gray photo of a view; depths agree within a relative tolerance.
+    Semi-global matching with each neighbor guesses depths; PatchMatch with all neighbors chooses and improves.
+    `load` returns the gray photo of a view.
     """
     image = load(view)
     # gray values are sampled at pixel centers
     centered = replace(view, sample_px=0.5)
     neighbors: list[tuple[View, GrayImage]] = []
     depths: list[DepthArray] = []
-    parallaxes: list[NDArray[np.float32]] = []
     reason = "no photo shares enough points"
     for neighbor in candidates:
         rectification = rectify(centered, neighbor)
@@ -60,17 +58,12 @@ def match_depths(
         neighbors.append((neighbor, load(neighbor)))
         left, right = rectification.warp(image, neighbors[-1][1], (centered, neighbor))
         disparity = disparities(left, right, rectification.disparities)
-        depth, parallax = depths_from_disparities(disparity, rectification, centered, neighbor)
-        depths.append(depth)
-        parallaxes.append(parallax)
+        depths.append(depths_from_disparities(disparity, rectification, centered, neighbor))
         if len(depths) == count:
             break
     if not depths:
         return Rejected(reason)
-    merged = merge_hypotheses(np.stack(depths), np.stack(parallaxes), tolerance)
-    planes = fit_planes(merged)
-    planes[..., 0] = np.divide(1, merged, out=np.zeros_like(merged), where=merged > 0)
-    cost = improve_planes(planes, centered, image, neighbors)
+    planes, cost = match_planes(np.stack(depths), centered, image, neighbors)
     mean = cv2.blur(image, (3, 3))
     cost[(mean <= OPTIONS.clipped_gray) | (mean >= 255 - OPTIONS.clipped_gray)] = NO_MATCH
     # at the view's position inside the pixel
@@ -78,41 +71,6 @@ def match_depths(
     known = (planes[..., 0] > 0) & (inverse > 0) & (cost < NO_MATCH)
     depth = np.divide(1, inverse, out=np.zeros_like(inverse), where=known)
     return DepthEstimate(depth, np.where(known, np.maximum(1 - cost, 0), np.float32(0)))
-
-
-def merge_hypotheses(depths: NDArray[np.float32], parallaxes: NDArray[np.float32], tolerance: float) -> DepthArray:
-    """Fuse depths (N, H, W) of all neighbors, 0 where unknown, with their parallaxes (N, H, W) in pixels.
-
-    At each pixel, the largest-weight group of depths within the relative tolerance of one of them wins and is averaged.
-    The weight of a depth is its squared parallax, which is inversely proportional to its variance.
-
-    Return (H, W) the depth, 0 where no neighbor has one.
-    """
-    depth = np.zeros(depths.shape[1:], np.float32)
-    _merge(depths, parallaxes, tolerance, depth)
-    return depth
-
-
-@kernel
-def _merge(depths: NDArray[np.float32], parallaxes: NDArray[np.float32], tolerance: float, depth: DepthArray) -> None:
-    count, height, width = depths.shape
-    for row in range(height):
-        for col in range(width):
-            heaviest = 0.0
-            for i in range(count):
-                z = depths[i, row, col]
-                if z <= 0:
-                    continue
-                weight, mean = 0.0, 0.0
-                for j in range(count):
-                    other = depths[j, row, col]
-                    if other > 0 and abs(other - z) <= tolerance * z:
-                        w = parallaxes[j, row, col] ** 2
-                        weight += w
-                        mean += w / other  # disparity noise is inverse-depth noise
-                if weight > heaviest:
-                    heaviest = weight
-                    depth[row, col] = weight / mean
 
 
 def count_maps(

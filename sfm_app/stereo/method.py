@@ -99,7 +99,7 @@ def _match(inputs: Shared[_Inputs], level: int, index: int) -> Rejected | None:
         return None
     candidates = [views[other] for other in task.ranked[index]]
     try:
-        estimate = task.steps.match(view, candidates, task.store.photo, options.neighbors, task.tolerance(level))
+        estimate = task.steps.match(view, candidates, task.store.photo, options.neighbors)
     except FAILURES as err:
         return Rejected(f"the computation failed: {error_reason(err)}")
     if isinstance(estimate, Rejected):

@@ -2,8 +2,8 @@
 
 Bleyer, Rhemann, Rother: PatchMatch stereo. BMVC 2011; Schoenberger et al.: Pixelwise view selection for unstructured
 multi-view stereo. ECCV 2016 (the weighted correlation). Semi-global matching prefers fronto-parallel surfaces and
-widens the foreground. Initialized with its depths, one sweep finds slanted surfaces and the true borders; a second one
-would improve 1 % of the pixels.
+widens the foreground. From its depths, one sweep finds slanted surfaces and the true borders; a second one would
+improve 1 % of the pixels.
 """
 
 from collections.abc import Sequence
@@ -39,6 +39,8 @@ MIN_GAIN = 0.01
 """Smallest decrease of the cost that replaces a plane; without it, noise would make flat areas rough."""
 STEP_PX = 0.3
 """Largest random change of a trial plane, in pixels of parallax."""
+SAME = 0.01
+"""Relative difference within which guesses of a depth are the same. Chosen by hand."""
 RADIUS_PX = 5
 """Radius of the window of a plane fit."""
 MAX_STEP = 0.02
@@ -62,21 +64,25 @@ class PatchOptions:
 OPTIONS = PatchOptions()
 
 
-def improve_planes(
-    planes: PlaneArray, view: View, image: GrayImage, others: Sequence[tuple[View, GrayImage]]
-) -> NDArray[np.float32]:
-    """Improve planes (H, W, 3) about the pixel centers in place, in a sweep down and to the right.
+def match_planes(
+    guesses: NDArray[np.float32], view: View, image: GrayImage, others: Sequence[tuple[View, GrayImage]]
+) -> tuple[PlaneArray, NDArray[np.float32]]:
+    """Return planes (H, W, 3) about the pixel centers, and their costs (H, W) in [0, 2]; 2 where unknown.
 
-    A pixel tries the planes of its upper and left neighbors, and small random changes of its own plane. The
-    cost of a plane is 1 - the normalized cross-correlation of the pixel's window with its image in a neighboring photo,
-    averaged over the better half of the photos, because the others may be occluded. Weights in the window fall with the
-    distance and with the difference in gray from the center. Returns the cost (H, W) in [0, 2]; 2 where unknown.
+    A pixel starts from the first of its guesses (N, H, W), depths or 0. In a sweep down and to the right it tries the
+    others, the planes of its upper and left neighbors, and a small random change of its own plane. The cost of a plane
+    is 1 - the normalized cross-correlation of the pixel's window with its image in a neighboring photo, averaged over
+    the better half of the photos, because the others may be occluded. Weights in the window fall with the distance and
+    with the difference in gray from the center.
     """
+    first = np.take_along_axis(guesses, np.argmax(guesses > 0, axis=0)[None], axis=0)[0]
+    planes = fit_planes(first)
+    planes[..., 0] = np.divide(1, first, out=np.zeros_like(first), where=first > 0)
     near = np.exp(-0.5 * (STEPS[:, None] ** 2 + STEPS**2) / OPTIONS.sigma_px**2)
     alike = np.exp(-np.arange(256) / OPTIONS.falloff_gray)
     cost = np.full(image.shape, NO_MATCH, np.float32)
-    _sweep(image, (near, alike), stack_photos(view, others), planes, cost)
-    return cost
+    _sweep(image, (near, alike), stack_photos(view, others), guesses, planes, cost)
+    return planes, cost
 
 
 def stack_photos(view: View, others: Sequence[tuple[View, GrayImage]]) -> PhotoStack:
@@ -94,7 +100,10 @@ def stack_photos(view: View, others: Sequence[tuple[View, GrayImage]]) -> PhotoS
 
 
 @kernel
-def _sweep(image: GrayImage, falloff: Any, others: Any, planes: PlaneArray, cost: NDArray[np.float32]) -> None:
+def _sweep(
+    image: GrayImage, falloff: Any, others: Any, guesses: NDArray[np.float32], planes: PlaneArray,
+    cost: NDArray[np.float32],
+) -> None:  # fmt: skip
     height, width = image.shape
     weights, grays = np.empty(SIDE * SIDE, np.float32), np.empty(SIDE * SIDE, np.float32)
     costs = np.empty(len(others[3]))
@@ -110,6 +119,11 @@ def _sweep(image: GrayImage, falloff: Any, others: Any, planes: PlaneArray, cost
             known = best[0] > 0
             lowest = _cost(row, col, best, window, others, costs) if known else NO_MATCH
             unit = _inverse_depth_per_px(row, col, best[0], others[3]) if known else 0.0
+            for k in range(len(guesses)):
+                depth = guesses[k, row, col]
+                if depth > 0 and abs(depth * best[0] - 1.0) > SAME:
+                    trial[0], trial[1], trial[2] = 1.0 / depth, best[1], best[2]
+                    lowest = _try_plane(row, col, trial, best, lowest, window, others, costs)
             lowest = _try_neighbors(row, col, planes, unit, trial, best, lowest, window, others, costs)
             if lowest < NO_MATCH:
                 unit = _inverse_depth_per_px(row, col, best[0], others[3])

@@ -202,27 +202,25 @@ def disparities(left: GrayImage, right: GrayImage, count: int) -> NDArray[np.flo
 
 def depths_from_disparities(
     disparity: NDArray[np.float32], rectification: Rectification, reference: View, neighbor: View
-) -> tuple[DepthArray, DepthArray]:
+) -> DepthArray:
     """Lift a disparity map (H, W) of the left canvas, < 0 where unknown, to depths of the reference.
 
-    Return (H, W) depths, 0 where unknown or outside the neighbor, and (H, W) the parallax in pixels, to which their
-    relative accuracy is proportional.
+    Return (H, W) depths, 0 where unknown, outside the neighbor, or where the parallax is below a pixel.
     """
     to_rectified = rectification.rotation @ reference.R.T @ np.linalg.inv(reference.K)
     size = np.array([reference.height, reference.width, neighbor.height, neighbor.width])
     depth = np.zeros((reference.height, reference.width), np.float32)
-    parallax = np.zeros_like(depth)
     r = rectification
     canvas = np.array(
         [r.baseline, r.theta_max, r.phi_min, r.columns_per_rad, r.rows_per_rad, r.disparities, r.offset_px]
     )
     into_neighbor = reference.projection_into(neighbor)
-    _lift(disparity, canvas, to_rectified, into_neighbor, reference.sample_px, size, depth, parallax)
-    return depth, parallax
+    _lift(disparity, canvas, to_rectified, into_neighbor, reference.sample_px, size, depth)
+    return depth
 
 
 @kernel
-def _lift(  # noqa: PLR0913
+def _lift(
     disparity: NDArray[np.float32],
     canvas: FloatArray,
     to_rectified: FloatArray,
@@ -230,7 +228,6 @@ def _lift(  # noqa: PLR0913
     sample: float,
     size: IndexArray,
     depth: DepthArray,
-    parallax: DepthArray,
 ) -> None:
     baseline, theta_max, phi_min, columns_per_rad, rows_per_rad, margin, offset = canvas
     R = to_rectified
@@ -252,9 +249,8 @@ def _lift(  # noqa: PLR0913
                 continue
             # law of sines in the epipolar triangle; across = |ray| sin(theta)
             sine = np.sin(angle) * np.sin(theta + angle) / np.sin(theta)
-            shift = columns_per_rad * sine
-            # smaller parallaxes, near the epipole and far away, do not determine the depth
-            if shift < 1.0:
+            # parallaxes below a pixel, near the epipole and far away, do not determine the depth
+            if columns_per_rad * sine < 1.0:
                 continue
             z = baseline * np.sin(theta + angle) / np.sin(angle) / np.sqrt(a * a + across * across)
             p2 = z * (P[2, 0] * x + P[2, 1] * y + P[2, 2]) + P[2, 3]
@@ -265,7 +261,6 @@ def _lift(  # noqa: PLR0913
             # beyond the neighbor's border the matcher only extrapolates
             if 2 < p0 < size[3] - 2 and 2 < p1 < size[2] - 2:
                 depth[row, col] = z
-                parallax[row, col] = shift
 
 
 @kernel

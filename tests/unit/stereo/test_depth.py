@@ -1,4 +1,4 @@
-"""Depth maps from photos; fusion of neighbors, confirmation by other maps, speckles."""
+"""Depth maps from photos; confirmation by other maps, speckles."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_app.stereo import DepthEstimate, DepthMap, confirm_depths, match_depths, rank_neighbors
-from sfm_app.stereo.depth import OPTIONS, count_maps, filter_speckles, merge_hypotheses
+from sfm_app.stereo.depth import OPTIONS, count_maps, filter_speckles
 from sfm_app.types import Rejected
 
 slow = pytest.mark.slow
@@ -22,8 +22,7 @@ def views(make_view):
 def matched(plane, views):
     ranked = rank_neighbors(views, 3)
     return [
-        match_depths(view, [views[j] for j in row], plane.photo, 3, 0.01)
-        for view, row in zip(views, ranked, strict=True)
+        match_depths(view, [views[j] for j in row], plane.photo, 3) for view, row in zip(views, ranked, strict=True)
     ]
 
 
@@ -59,7 +58,7 @@ def test_wrong_depths_are_dropped(plane, views, matched):
 @slow
 def test_two_photos_confirm_each_other_and_the_same_input_gives_the_same_bytes(plane, views, matched):
     maps = confirm_depths(views[1], plane.photo(views[1]), matched[1], others(views, matched, 1)[:1], 2, 0.01)
-    again = match_depths(views[1], [views[j] for j in rank_neighbors(views, 3)[1]], plane.photo, 3, 0.01)
+    again = match_depths(views[1], [views[j] for j in rank_neighbors(views, 3)[1]], plane.photo, 3)
 
     assert isinstance(maps, DepthMap)
     assert np.mean(maps.depth > 0) > 0.4
@@ -69,8 +68,8 @@ def test_two_photos_confirm_each_other_and_the_same_input_gives_the_same_bytes(p
 
 @slow
 def test_a_photo_without_neighbors_has_a_reason(plane, views):
-    assert match_depths(views[0], [], plane.photo, 3, 0.01) == Rejected("no photo shares enough points")
-    same_place = match_depths(views[0], [views[0]], plane.photo, 3, 0.01)
+    assert match_depths(views[0], [], plane.photo, 3) == Rejected("no photo shares enough points")
+    same_place = match_depths(views[0], [views[0]], plane.photo, 3)
     assert same_place == Rejected("the photos were taken from the same place")
     empty = np.zeros((180, 240), np.float32)
     nothing, blank = DepthEstimate(empty, empty), np.zeros((180, 240), np.uint8)
@@ -98,7 +97,7 @@ def test_blank_photos_stay_empty(views):
     def sky(view):
         return rng.normal(200, 1.5, (view.height, view.width)).astype(np.uint8)
 
-    estimate = match_depths(views[1], [views[0], views[2]], sky, 2, 0.01)
+    estimate = match_depths(views[1], [views[0], views[2]], sky, 2)
 
     assert np.median(estimate.confidence) < 0.3
     maps = confirm_depths(views[1], sky(views[1]), estimate, [(views[j], estimate.depth) for j in (0, 2)], 2, 0.01)
@@ -113,41 +112,13 @@ def test_clipped_pixels_get_no_depth_from_their_neighbors(plane, views, gray):
         pixels[:, 120:] = gray
         return pixels
 
-    depth = match_depths(views[1], [views[0], views[2]], photo, 2, 0.01).depth
+    depth = match_depths(views[1], [views[0], views[2]], photo, 2).depth
 
     assert np.mean(depth[5:-5, 5:119] > 0) > 0.8
     assert not depth[:, 121:].any()
 
 
-# Fusion and confirmation.
-
-
-def pixels(*values: float) -> np.ndarray:
-    return np.array(values, np.float32).reshape(-1, 1, 1)
-
-
-def test_agreeing_depths_win_over_an_outlier():
-    depth = merge_hypotheses(pixels(5.0, 2.0, 5.02), pixels(10, 12, 10), 0.01)
-
-    assert 5.0 < depth[0, 0] < 5.02
-
-
-def test_weights_are_squared_parallaxes_of_inverse_depths():
-    depth = merge_hypotheses(pixels(5.0, 5.04), pixels(30, 10), 0.01)
-
-    np.testing.assert_allclose(depth[0, 0], 10 / (9 / 5.0 + 1 / 5.04), rtol=1e-6)
-    assert merge_hypotheses(pixels(0, 0), pixels(0, 0), 0.01)[0, 0] == 0
-
-
-def test_the_order_of_the_neighbors_does_not_matter():
-    rng = np.random.default_rng(0)
-    depths = rng.uniform(4.95, 5.05, (3, 8, 9)).astype(np.float32)
-    parallaxes = rng.uniform(5, 20, depths.shape).astype(np.float32)
-
-    one = merge_hypotheses(depths, parallaxes, 0.05)
-    other = merge_hypotheses(depths[::-1].copy(), parallaxes[::-1].copy(), 0.05)
-
-    np.testing.assert_allclose(one, other, rtol=1e-6)
+# Confirmation.
 
 
 def test_true_depths_are_confirmed_and_wrong_ones_are_not(plane, make_view):

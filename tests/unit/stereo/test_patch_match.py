@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_app.stereo.patch_match import NO_MATCH, fit_planes, improve_planes, plane_normals
+from sfm_app.stereo.patch_match import NO_MATCH, fit_planes, match_planes, plane_normals
 from sfm_app.stereo.view import View
 
 CENTERS = [(0.5, 0, 0), (-0.4, 0.2, 0), (0, 0.5, 0.3)]
@@ -21,16 +21,15 @@ def setting(plane, make_view):
 
 @pytest.fixture(scope="module")
 def seeds(plane, setting):
-    """The true inverse depth, level, in every tenth row; nothing elsewhere."""
-    planes = np.zeros((*setting[1].shape, 3), np.float32)
-    planes[10::10, 10:-10, 0] = 1 / plane.depth(setting[0])[10::10, 10:-10]
-    return planes
+    """(1, H, W) the true depth in every tenth row; nothing elsewhere."""
+    depths = np.zeros((1, *setting[1].shape), np.float32)
+    depths[0, 10::10, 10:-10] = plane.depth(setting[0])[10::10, 10:-10]
+    return depths
 
 
 @pytest.mark.slow
 def test_the_plane_spreads_from_seeds(plane, setting, seeds):
-    planes = seeds.copy()
-    cost = improve_planes(planes, *setting)
+    planes, cost = match_planes(seeds, *setting)
 
     inside = np.zeros(cost.shape, bool)
     inside[25:-25, 45:-45] = True
@@ -42,10 +41,10 @@ def test_the_plane_spreads_from_seeds(plane, setting, seeds):
 
 @pytest.mark.slow
 def test_wrong_depths_are_costly(plane, setting):
-    planes = np.zeros((*setting[1].shape, 3), np.float32)
-    planes[:, :120, 0] = 2.0 / plane.depth(setting[0])[:, :120]
+    depths = np.zeros((1, *setting[1].shape), np.float32)
+    depths[0, :, :120] = plane.depth(setting[0])[:, :120] / 2.0
 
-    cost = improve_planes(planes, *setting)
+    planes, cost = match_planes(depths, *setting)
 
     wrong = planes[..., 0] * plane.depth(setting[0]) > 1.2
     assert wrong.sum() > 1000
@@ -54,12 +53,30 @@ def test_wrong_depths_are_costly(plane, setting):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("right", [0, 1, 2])
+def test_the_photos_choose_the_right_one_of_several_guesses(plane, setting, right):
+    depth = plane.depth(setting[0]).astype(np.float32)
+    checkered = np.indices(depth.shape).sum(axis=0) % 8 < 4
+    guesses = np.stack([factor * depth * checkered for factor in (0.7, 1.3, 0.8)])
+    guesses[right] = 1.002 * depth * checkered
+
+    planes, cost = match_planes(guesses, *setting)
+
+    inside = np.zeros(cost.shape, bool)
+    inside[25:-25, 45:-45] = True
+    error = np.abs(planes[..., 0] * depth - 1)[inside & (cost < 0.5)]
+    assert len(error) > 0.95 * inside.sum()
+    assert 1e-5 < np.median(error) < 4e-3
+    assert np.mean(error > 0.02) < 0.02
+
+
+@pytest.mark.slow
 def test_a_flat_photo_correlates_with_nothing_and_one_hidden_view_does_not_matter(setting, seeds):
     view, photo, others = setting
     hidden = [(others[0][0], np.zeros_like(others[0][1])), *others[1:]]
 
-    assert np.all(improve_planes(seeds.copy(), view, np.full_like(photo, 128), others) >= 0.95)
-    assert np.median(improve_planes(seeds.copy(), view, photo, hidden)[30:-30, 50:-50]) < 0.3
+    assert np.all(match_planes(seeds, view, np.full_like(photo, 128), others)[1] >= 0.95)
+    assert np.median(match_planes(seeds, view, photo, hidden)[1][30:-30, 50:-50]) < 0.3
 
 
 # Planes through depth maps.
