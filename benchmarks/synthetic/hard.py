@@ -1,4 +1,4 @@
-"""Folders like those on which the program failed: equal boxes, many cameras, a symmetric palace, darkness and haze."""
+"""Folders like those on which the program failed: equal boxes, many cameras, a palace, brass, darkness and haze."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -12,7 +12,7 @@ from benchmarks.synthetic.trouble import PhotoDefects, TroubledFolder, mixed_cam
 from sfm_app.synthetic import scenes
 from sfm_app.synthetic.cameras import ArcOptions, Camera, Views, arc, look_at, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions
-from sfm_app.synthetic.shapes import Body, Shape, SyntheticScene, arch, ball, box, ground, revolve
+from sfm_app.synthetic.shapes import Body, Material, Shape, SyntheticScene, arch, ball, box, ground, revolve
 
 OPTIONS = PhotoOptions(supersampling=1, quality=85, exposure_ev=0.4)
 SIZES = ((800, 600), (640, 480), (800, 533), (600, 800), (720, 405), (1024, 683), (640, 640))
@@ -103,6 +103,34 @@ def _garden(rng: np.random.Generator) -> list[Body]:
     return bodies
 
 
+def brass() -> TroubledFolder:
+    """Return 23 photos, close up, of a miniature of brushed brass on white paper."""
+    brass, white = (196, 156, 82), (236, 236, 232)
+    metal = Material(
+        pattern="stone", base=brass, second=(168, 124, 58), joint=brass, scale=0.05, contrast=0.12, shine=0.75
+    )  # fmt: skip
+    foot = np.array(
+        [[0.0, 0.0], [0.3, 0.0], [0.3, 0.05], [0.12, 0.1], [0.08, 0.3], [0.2, 0.42], [0.22, 0.5], [0.0, 0.5]]
+    )
+    parts = [
+        revolve(foot, segments=96),
+        box(0.5, 0.08, 0.26, spacing=0.02).move((0.0, 0.5, 0.0)),
+        box(0.3, 0.16, 0.2, spacing=0.02).move((-0.08, 0.58, 0.0), turn_deg=8.0),
+        ball(0.12, bumps=0.12, seed=5).move((0.12, 0.66, 0.02)),
+        arch(0.1, 0.03, 0.06).move((0.0, 0.1, 0.2)),
+    ]
+    paper = Material(pattern="stone", base=white, second=(228, 228, 224), joint=white, scale=0.4, contrast=0.02)
+    scene = SyntheticScene(
+        "brass", (Body(assemble(parts), metal), Body(ground((-4.0, 4.0), (-4.0, 4.0), 0.0), paper)),
+        to_light=(0.4, 0.8, 0.45), sky=0.6, sun=0.6,
+    )  # fmt: skip
+    walk = ArcOptions(
+        photos=23, sweep_deg=300.0, distance=(1.6, 2.0), height=(0.7, 1.4), aim=(0.0, 0.37, 0.0), aim_spread=0.05,
+        roll_deg=5.0,
+    )  # fmt: skip
+    return _folder("brushed metal", scene, arc(make_camera(900, 675, focal_widths=1.6), walk, 11))
+
+
 def dark() -> TroubledFolder:
     """Return the ornament at 8 % of its brightness."""
     return _ornament("darkness", (0.08, 0.0))
@@ -126,6 +154,7 @@ HARD: Mapping[str, Callable[[], TroubledFolder]] = {
     "statue-by-many": statue_by_many,
     "equal-boxes": equal_boxes,
     "palace": palace,
+    "brass": brass,
     "dark": dark,
     "haze": haze,
 }

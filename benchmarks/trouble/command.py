@@ -2,7 +2,7 @@
 
     python -m benchmarks.trouble --cache CACHE --folders 200 --keep
     python -m benchmarks.trouble --cache CACHE --only 17 42
-    python -m benchmarks.trouble --cache CACHE --hard statue-by-many equal-boxes palace dark haze --name trouble-hard
+    python -m benchmarks.trouble --cache CACHE --hard statue-by-many palace brass dark --name trouble-hard
     python -m benchmarks.trouble --cache CACHE --folders 100 --keep --without learned-cameras finer-features
 
 A seed determines a folder. With --keep, runs of the same program are reused. --without runs the scene once more without

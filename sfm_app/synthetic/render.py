@@ -178,10 +178,30 @@ def shade(hits: Any, tables: Any, total: FloatArray) -> None:
         facing = at[0] * lights[0, 0] + at[1] * lights[0, 1] + at[2] * lights[0, 2]
         sun = max(0.0, facing) if lit[i] else 0.0
         sky = at[6] * (0.65 + 0.35 * at[1])
+        shine = row[13]
+        room, glint = _reflect(directions[i], at, lights[0]) if shine > 0.0 else (0.0, 0.0)
+        glint = glint if lit[i] else 0.0
         for c in range(3):
             color = row[4 + c] + second * (row[7 + c] - row[4 + c])
             color += joint * (row[10 + c] - color)
-            total[i, c] += color * bright * (sun * lights[1, c] + sky * lights[2, c])
+            light = (1.0 - shine) * sun + shine * glint, (1.0 - shine) * sky + shine * room
+            total[i, c] += color * bright * (light[0] * lights[1, c] + light[1] * lights[2, c])
+
+
+@kernel
+def _reflect(direction: FloatArray, normal: FloatArray, to_sun: FloatArray) -> tuple[float, float]:
+    """Return what a rough mirror shows of a room with windows around, and of the sun."""
+    along, length = 0.0, 0.0
+    for c in range(3):
+        along += direction[c] * normal[c]
+        length += direction[c] * direction[c]
+    length = np.sqrt(length)
+    x = (direction[0] - 2.0 * along * normal[0]) / length
+    y = (direction[1] - 2.0 * along * normal[1]) / length
+    z = (direction[2] - 2.0 * along * normal[2]) / length
+    windows = 0.5 + 0.5 * np.sin(5.0 * np.arctan2(x, z))
+    near_sun = max(0.0, x * to_sun[0] + y * to_sun[1] + z * to_sun[2])
+    return 0.3 + 0.5 * max(0.0, y) + 0.6 * windows * (1.0 - abs(y)), 2.0 * near_sun**30
 
 
 Colors = NDArray[np.uint8]

@@ -221,11 +221,13 @@ class Material:
     """Size of a brick, slab, leaf or band, in scene units."""
     contrast: float = 0.5
     """Strength of the fine grain, 0..1."""
+    shine: float = 0.0
+    """Share of the light that brushed metal reflects, 0..1: it moves with the camera."""
 
     def row(self, seed: int) -> FloatArray:
-        """Return the (13,) parameters for the kernels: pattern, scale, contrast, seed, then three linear RGB colors."""
+        """Return the (14,) parameters for the kernels: pattern, scale, contrast, seed, linear RGB colors, shine."""
         colors = [(np.array(c) / 255.0) ** 2.2 for c in (self.base, self.second, self.joint)]
-        return np.concatenate([[PATTERNS.index(self.pattern), self.scale, self.contrast, seed], *colors])
+        return np.concatenate([[PATTERNS.index(self.pattern), self.scale, self.contrast, seed], *colors, [self.shine]])
 
 
 @kernel

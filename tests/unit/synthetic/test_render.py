@@ -48,6 +48,21 @@ def test_two_views_show_the_same_surface_in_the_right_pixels(prepared, still_lif
     assert all(mismatch(dx, dy) > 1.2 * best for dx, dy in [(0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)])
 
 
+@pytest.mark.parametrize("shine", [0.0, 0.6])
+def test_only_what_metal_reflects_moves_with_the_camera(shine):
+    gray = Material(
+        pattern="stone", base=(150,) * 3, second=(150,) * 3, joint=(150,) * 3, contrast=0.0, shine=shine
+    )  # fmt: skip
+    scene = render.prepare(SyntheticScene("wall", (Body(box(4.0, 4.0, 0.2), gray),), to_light=(0.2, 0.3, 1.0)))
+    middle, camera = np.array([0.0, 2.0, 0.1]), make_camera(41, 31)
+    centers = np.array([[0.0, 2.0, 3.0], [1.5, 2.0, 2.5], [-2.0, 3.0, 2.0]])
+    colors = [render.render_scene(scene, camera, look_at(center, middle), 1)[15, 20] for center in centers]
+
+    change = np.ptp(colors, axis=0) / np.mean(colors, axis=0)
+    assert np.all(change > 0.1) if shine else np.all(change < 1e-6)
+    assert np.all(np.mean(colors, axis=0) > 0.05)
+
+
 def test_a_pixel_is_seen_through_its_center():
     """A wall whose edges lie at x = 10.25 and 30.75, y = 4.25 and 15.75 pixels covers whole pixels by their centers."""
     white = Material(pattern="stone", base=(230, 230, 230), second=(230, 230, 230), joint=(230, 230, 230))
