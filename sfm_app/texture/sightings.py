@@ -162,7 +162,9 @@ def score_faces(view: PhotoView, photo: NDArray[np.uint8], used: BoolArray | Non
     _mark_jumps(nearness, jumps)
     seen = photo, nearness, cv2.dilate(jumps, np.ones((side, side), np.uint8))
     score, color = np.zeros(len(near), np.float32), np.zeros((len(near), 3), np.uint8)
-    _measure(view.row, seen, mesh.vertices, faces, OPTIONS.slack * mesh.spacing, score, color)
+    slack = OPTIONS.slack * mesh.spacing
+    _measure(view.row, seen, mesh.vertices, faces, slack, score, color)
+    _drop_hidden(view.row, nearness, mesh.vertices, faces, slack, score)
     if used is not None:
         masked = np.zeros((view.height + 1, view.width + 1), np.int32)
         np.cumsum(np.cumsum(~used, axis=0, dtype=np.int32), axis=1, out=masked[1:, 1:])
@@ -284,6 +286,40 @@ def _measure(
             for k in range(4):
                 total += sample(photo, x[k], y[k], channel)
             color[f, channel] = int(total / 4.0 + 0.5)
+
+
+@kernel
+def _drop_hidden(
+    camera: FloatArray, nearness: NDArray[np.float32], vertices: FloatArray, faces: IndexArray, slack: float,
+    score: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Set the score of triangles to 0 that something nearer hides between their corners.
+
+    Half a pixel along their outline may be hidden: the surface is inexact.
+    """
+    corner, near = np.empty((3, 2)), np.empty(3)
+    for f in range(len(faces)):
+        if score[f] <= 0.0:
+            continue
+        for k in range(3):
+            v = faces[f, k]
+            corner[k, 0], corner[k, 1], depth = project(camera, vertices[v, 0], vertices[v, 1], vertices[v, 2])
+            near[k] = 1.0 / depth
+        bx, by = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1]
+        cx, cy = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1]
+        # 1 / depth is linear in the photo
+        across = ((near[1] - near[0]) * cy - (near[2] - near[0]) * by) / (bx * cy - by * cx)
+        down = ((near[2] - near[0]) * bx - (near[1] - near[0]) * cx) / (bx * cy - by * cx)
+        hidden, outline = 0, np.hypot(bx, by) + np.hypot(cx, cy) + np.hypot(cx - bx, cy - by)
+        for y in range(int(corner[:, 1].min()), int(corner[:, 1].max()) + 1):
+            left, right = span(corner, 0, y + 0.5, y + 0.5)
+            if left > right:
+                continue
+            for x in range(int(left + 0.5), int(right + 0.5)):
+                own = near[0] + across * (x + 0.5 - corner[0, 0]) + down * (y + 0.5 - corner[0, 1])
+                hidden += nearness[y, x] * (1.0 / own - slack) > 1.0
+        if hidden > 0.5 * outline:
+            score[f] = 0.0
 
 
 @kernel

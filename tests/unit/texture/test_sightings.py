@@ -57,6 +57,23 @@ def test_triangles_behind_others_have_no_view_and_those_beside_outlines_a_lower_
     assert beside.sum() > 10
 
 
+@pytest.mark.parametrize(("half_px", "seen"), [(60.0, False), (6.0, True)])
+def test_a_large_triangle_with_an_object_between_its_corners_has_no_view(half_px, seen):
+    """The object hides neither the corners nor the center; a small one does not matter."""
+    view = around(2, size=(1600, 1200), k1=0.0)[0]
+    board = np.array([550.0, 360.0]) + half_px * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
+    pixels = np.concatenate([[[300.0, 200.0], [800.0, 1000.0], [1300.0, 300.0]], board])
+    rays = np.column_stack([pixels, np.ones(7)]) @ np.linalg.inv(view.K).T @ view.R
+    vertices = view.center + rays * np.array([3.0] * 3 + [2.0] * 4)[:, None]
+    faces = np.array([[0, 1, 2], [3, 4, 5], [3, 5, 6]])
+    photo = np.full((1200, 1600, 3), 100, np.uint8)
+
+    found = score_faces(view, photo, None, facets(Surface(vertices, faces, np.zeros((7, 3), np.uint8))))
+
+    assert (0 in found.face) == seen
+    assert {1, 2} <= set(found.face.tolist())
+
+
 def test_views_are_found_by_photo_and_triangle():
     score = np.array([[0, 2, 0, 5.0], [1, 0, 0, -3], [0, 0, 0, 0]])
     seen = sightings(score)
