@@ -105,9 +105,9 @@ def _garden(rng: np.random.Generator) -> list[Body]:
 
 def brass() -> TroubledFolder:
     """Return 23 photos, close up, of a miniature of brushed brass on white paper."""
-    brass, white = (196, 156, 82), (236, 236, 232)
+    yellow, white = (196, 156, 82), (236, 236, 232)
     metal = Material(
-        pattern="stone", base=brass, second=(168, 124, 58), joint=brass, scale=0.05, contrast=0.12, shine=0.75
+        pattern="stone", base=yellow, second=(168, 124, 58), joint=yellow, scale=0.05, contrast=0.12, shine=0.75
     )  # fmt: skip
     foot = np.array(
         [[0.0, 0.0], [0.3, 0.0], [0.3, 0.05], [0.12, 0.1], [0.08, 0.3], [0.2, 0.42], [0.22, 0.5], [0.0, 0.5]]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.raster import draw
+from sfm_app.geometry.raster import NOTHING, draw
 from sfm_app.geometry.triangles import Clusters, bucket_order, cluster, number_vertices, unique_edges
 from sfm_app.jit import kernel
 from sfm_app.texture.views import POSE, PhotoView, project, sample
@@ -157,14 +157,12 @@ def score_faces(view: PhotoView, photo: NDArray[np.uint8], used: BoolArray | Non
     sharp = sharpness(photo, used)  # before the depth buffer: both need as much memory
     near = mesh.clusters.find_in_cone(view.center, view.axis, view.widest_angle)
     faces = mesh.faces[near]
-    nearness = _draw_nearness(view, mesh.vertices, faces)
+    nearness, shown_px = _draw(view, mesh.vertices, faces)
     jumps, side = np.zeros(nearness.shape, np.uint8), 2 * round(RIM * max(nearness.shape)) + 1
     _mark_jumps(nearness, jumps)
-    seen = photo, nearness, cv2.dilate(jumps, np.ones((side, side), np.uint8))
+    seen = photo, nearness, shown_px, cv2.dilate(jumps, np.ones((side, side), np.uint8))
     score, color = np.zeros(len(near), np.float32), np.zeros((len(near), 3), np.uint8)
-    slack = OPTIONS.slack * mesh.spacing
-    _measure(view.row, seen, mesh.vertices, faces, slack, score, color)
-    _drop_hidden(view.row, nearness, mesh.vertices, faces, slack, score)
+    _measure(view.row, seen, mesh.vertices, faces, OPTIONS.slack * mesh.spacing, score, color)
     if used is not None:
         masked = np.zeros((view.height + 1, view.width + 1), np.int32)
         np.cumsum(np.cumsum(~used, axis=0, dtype=np.int32), axis=1, out=masked[1:, 1:])
@@ -173,14 +171,14 @@ def score_faces(view: PhotoView, photo: NDArray[np.uint8], used: BoolArray | Non
     return FaceView(near[usable].astype(np.int32), score[usable], color[usable], sharp)
 
 
-def _draw_nearness(view: PhotoView, vertices: FloatArray, faces: IndexArray) -> NDArray[np.float32]:
-    """Draw triangles (T, 3) into a photo: (H, W) 1 / depth, 0 without surface."""
+def _draw(view: PhotoView, vertices: FloatArray, faces: IndexArray) -> tuple[NDArray[np.float32], IndexArray]:
+    """Draw triangles (T, 3) into a photo: (H, W) 1 / depth, 0 without surface; (T,) pixels that show each triangle."""
     used, own = number_vertices(faces)
     pixels, size = np.empty((len(used), 3)), (view.height, view.width)
     _project_all(view.row, vertices[used], pixels)
-    nearness = np.zeros(size, np.float32)
-    draw(pixels, own, nearness, np.empty(size, np.int32))
-    return nearness
+    nearness, face = np.zeros(size, np.float32), np.full(size, NOTHING, np.int32)
+    draw(pixels, own, nearness, face)
+    return nearness, np.bincount(face.ravel() + 1, minlength=len(faces) + 1)[1:]
 
 
 @kernel
@@ -251,10 +249,10 @@ def _measure(
 ) -> None:
     """Write area in pixels times cosine, and mean color, of triangles within the photo that face the camera.
 
-    `seen` are the photo, the nearness of `_draw_nearness`, and the pixels beside outlines. Triangles hidden at the
-    center or at two corners are left out.
+    `seen` are the photo, the results of `_draw`, and the pixels beside outlines. Triangles hidden at the center or at
+    two corners are left out, and those hidden by more than half a pixel along their sides: the surface is inexact.
     """
-    photo, nearness, rim = seen
+    photo, nearness, shown_px, rim = seen
     height, width = photo.shape[0], photo.shape[1]
     x, y, corner = np.empty(4), np.empty(4), np.empty((4, 3))
     for f in range(len(faces)):
@@ -278,7 +276,10 @@ def _measure(
         cosine = _cosine(camera, corner)
         # y points down in the photo: triangles counterclockwise from outside have a negative area
         area = -0.5 * ((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]))
-        if cosine < MIN_COSINE or area <= 0.0:
+        sides = (
+            np.hypot(x[1] - x[0], y[1] - y[0]) + np.hypot(x[2] - x[1], y[2] - y[1]) + np.hypot(x[0] - x[2], y[0] - y[2])
+        )
+        if cosine < MIN_COSINE or area <= 0.0 or area - shown_px[f] > 0.5 * sides:
             continue
         score[f] = area * cosine * (RIM_FACTOR if beside else 1.0)
         for channel in range(3):
@@ -286,40 +287,6 @@ def _measure(
             for k in range(4):
                 total += sample(photo, x[k], y[k], channel)
             color[f, channel] = int(total / 4.0 + 0.5)
-
-
-@kernel
-def _drop_hidden(
-    camera: FloatArray, nearness: NDArray[np.float32], vertices: FloatArray, faces: IndexArray, slack: float,
-    score: NDArray[np.float32],
-) -> None:  # fmt: skip
-    """Set the score of triangles to 0 that something nearer hides between their corners.
-
-    Half a pixel along their outline may be hidden: the surface is inexact.
-    """
-    corner, near = np.empty((3, 2)), np.empty(3)
-    for f in range(len(faces)):
-        if score[f] <= 0.0:
-            continue
-        for k in range(3):
-            v = faces[f, k]
-            corner[k, 0], corner[k, 1], depth = project(camera, vertices[v, 0], vertices[v, 1], vertices[v, 2])
-            near[k] = 1.0 / depth
-        bx, by = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1]
-        cx, cy = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1]
-        # 1 / depth is linear in the photo
-        across = ((near[1] - near[0]) * cy - (near[2] - near[0]) * by) / (bx * cy - by * cx)
-        down = ((near[2] - near[0]) * bx - (near[1] - near[0]) * cx) / (bx * cy - by * cx)
-        hidden, outline = 0, np.hypot(bx, by) + np.hypot(cx, cy) + np.hypot(cx - bx, cy - by)
-        for y in range(int(corner[:, 1].min()), int(corner[:, 1].max()) + 1):
-            left, right = span(corner, 0, y + 0.5, y + 0.5)
-            if left > right:
-                continue
-            for x in range(int(left + 0.5), int(right + 0.5)):
-                own = near[0] + across * (x + 0.5 - corner[0, 0]) + down * (y + 0.5 - corner[0, 1])
-                hidden += nearness[y, x] * (1.0 / own - slack) > 1.0
-        if hidden > 0.5 * outline:
-            score[f] = 0.0
 
 
 @kernel
