@@ -178,7 +178,18 @@ def _draw(view: PhotoView, vertices: FloatArray, faces: IndexArray) -> tuple[NDA
     _project_all(view.row, vertices[used], pixels)
     nearness, face = np.zeros(size, np.float32), np.full(size, NOTHING, np.int32)
     draw(pixels, own, nearness, face)
-    return nearness, np.bincount(face.ravel() + 1, minlength=len(faces) + 1)[1:]
+    shown_px = np.zeros(len(faces), np.int64)
+    _count(face, shown_px)
+    return nearness, shown_px
+
+
+@kernel
+def _count(face: IntArray, shown_px: IndexArray) -> None:
+    """Count the pixels (H, W) of each triangle, without the copies that `np.bincount` makes of a large photo."""
+    for row in face:
+        for f in row:
+            if f != NOTHING:
+                shown_px[f] += 1
 
 
 @kernel
