@@ -1,5 +1,7 @@
 """Rectification in every direction, reasons of rejected pairs, disparities and their depths."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -150,6 +152,17 @@ def test_depths_lie_on_the_plane_for_any_baseline(plane, make_view, center, samp
     assert np.mean(known) > (0.7 if center[2] < 0.5 else 0.5)  # forward there is nothing about the epipole
     assert abs(np.median(error_px)) < 0.08  # pixel centers misplaced in one of the photos would make it 0.5
     assert 0.01 < np.median(np.abs(error_px)) < 0.15
+
+
+@pytest.mark.parametrize(("disparity", "known"), [(0.9, False), (1.2, True)])
+def test_a_parallax_below_a_pixel_has_no_depth(make_view, disparity, known):
+    view, neighbor = make_view((0, 0, 0)), make_view((0.5, 0, 0))
+    rectification = replace(rectify(view, neighbor), offset_px=0.0)
+    everywhere = np.full(rectification.size[::-1], disparity, np.float32)
+
+    depth = depths_from_disparities(everywhere, rectification, view, neighbor)
+
+    assert (np.mean(depth > 0) > 0.5) if known else not depth.any()
 
 
 def test_pixels_outside_the_neighbor_have_no_depth(make_view):
