@@ -19,7 +19,7 @@ from sfm_app.estimation.calibrating import find_evidence
 from sfm_app.mapping.attempt import are_many_unregistered
 from sfm_app.mapping.passes import Outcome
 from sfm_app.matching.features import fill_database
-from sfm_app.plugins import SIFT_AFFINE
+from sfm_app.plugins import SIFT_AFFINE, FeatureMethod
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import finer_minutes, minutes_text
 from sfm_app.runtime.workspace import SubWorkspace
@@ -77,13 +77,18 @@ def _drop_repeats(rows: Rows) -> Rows:
     return rows[first[0] & first[1]]
 
 
-FOLDER, FEATURES = "finer", "features"
+FEATURES = "features"
 
 
-def lost_photos(best: Outcome, run: RunContext) -> list[int]:
-    """Return the photos missing in the main model; none where their share is small, or features are the finest."""
-    if run.settings.matching.features == SIFT_AFFINE:
-        return []
+def finer_methods(run: RunContext) -> list[FeatureMethod]:
+    """Return the features that see more than those of the run, cheap ones first: SIFT with affine shape, plug-ins."""
+    features, chosen = run.plugins.features, run.settings.matching.features
+    installed = (one for one in features.values() if one.sift is None and not one.unavailable())
+    return [one for one in (features[SIFT_AFFINE], *installed) if one.name != chosen]
+
+
+def lost_photos(best: Outcome) -> list[int]:
+    """Return the photos missing in the main model; none where their share is small."""
     registered = set(posed_photo_ids(best.main.model)) if best.main else set()
     lost = sorted(best.evidence.matches.images.keys() - registered)
     return lost if are_many_unregistered(len(lost), len(best.evidence.matches.images)) else []
@@ -105,21 +110,24 @@ def candidate_pairs(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
     return sorted(pairs)
 
 
-def find_finer_evidence(best: Outcome, run: RunContext) -> tuple[Evidence, RunContext] | None:
-    """Find finer features in lost photos and their likely neighbors, then geometry and cameras.
+def find_finer_evidence(best: Outcome, method: FeatureMethod, run: RunContext) -> tuple[Evidence, RunContext] | None:
+    """Find more features in lost photos and their likely neighbors, then geometry and cameras.
 
     Return the evidence, and a run in a folder of its own, where a killed run is resumed; None without new geometry.
     """
     first, matching = replace(best.evidence, intrinsics=best.calibrated), run.settings.matching
-    pairs = candidate_pairs(lost_photos(best, run), first.matches)
+    pairs = candidate_pairs(lost_photos(best), first.matches)
     tried = set(chain(*pairs))
     sizes = [(image.width, image.height) for key, image in first.matches.images.items() if key in tried]
-    minutes = finer_minutes(sizes, run.settings, run.workers)
-    run.progress.say(f"finer features of {len(sizes)} photos: {minutes_text(minutes)} more")
+    if method.sift is None:
+        time = f"{len(pairs)} pairs; {method.summary}"
+    else:
+        time = f"{minutes_text(finer_minutes(sizes, run.settings, run.workers))} more"
+    run.progress.say(f"{method.name} features of {len(sizes)} photos: {time}")
     looser = matching.model_copy(update={"max_ratio": max(OPTIONS.max_ratio, matching.max_ratio)})
     run = replace(
         run,
-        workspace=SubWorkspace(run.workspace, FOLDER),
+        workspace=SubWorkspace(run.workspace, method.name),
         settings=run.settings.model_copy(update={"matching": looser}),
         statistics={},
     )
@@ -127,7 +135,7 @@ def find_finer_evidence(best: Outcome, run: RunContext) -> tuple[Evidence, RunCo
     with translate_errors("extracting finer features"):
         if not finer.workspace.database.exists():
             write_match_graph(finer.workspace.database, replace(first.matches, keypoints={}, matches={}))
-    fill_database(run.plugins.feature_method(SIFT_AFFINE), finer, pairs)
+    fill_database(method, finer, pairs)
     with translate_errors("adding matches"):
         matches, enriched = add_matches(first.matches, *read_features(finer.workspace.database))
     if not enriched:

@@ -28,7 +28,7 @@ from sfm_app.mapping.attempt import (
     judge_model,
     support,
 )
-from sfm_app.mapping.feature_retry import find_finer_evidence, lost_photos
+from sfm_app.mapping.feature_retry import find_finer_evidence, finer_methods, lost_photos
 from sfm_app.mapping.look_alikes import OVERLAPS, with_false_joins
 from sfm_app.mapping.passes import MAPPERS, Mapper, Mappers, Outcome, Trial, guessed_intrinsics
 from sfm_app.mapping.splits import split_attempt
@@ -363,18 +363,23 @@ def learned_intrinsics(best: Outcome) -> Intrinsics:
     return replace(intrinsics, cameras=cameras)
 
 
-# Finer features, for photos that are unregistered.
+# Finer features, and those of an installed plug-in, for photos that are unregistered.
 
 
 def _lost_reason(best: Outcome, mapper: Mapper) -> str:
-    lost = len(lost_photos(best, mapper.run))
+    lost = len(lost_photos(best)) if finer_methods(mapper.run) else 0
     return "" if lost == 0 else "1 photo is unregistered" if lost == 1 else f"{lost} photos are unregistered"
 
 
 def _with_finer_features(best: Outcome, mapper: Mapper) -> Iterator[Outcome]:
-    finer = find_finer_evidence(best, mapper.run)
-    if finer is not None:
-        yield reconstruct(*finer, mapper.mappers, FIRST_LOOK)
+    """Map with the features of each method in turn, not with all together, until no photo is lost."""
+    for method in finer_methods(mapper.run):
+        finer = find_finer_evidence(best, method, mapper.run)
+        if finer is not None:
+            other = reconstruct(*finer, mapper.mappers, FIRST_LOOK)
+            yield other
+            if not lost_photos(other):
+                return
 
 
 RIVAL = Hypothesis("colmap-defaults", _rival_reason, _map_rival)

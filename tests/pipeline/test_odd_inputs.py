@@ -388,19 +388,20 @@ def odd_inputs_page():
     def plain(text):
         return "".join(c if c.isprintable() and c not in "|\udcff" else repr(c)[1:-1] for c in text)
 
-    states = {case: "used" if says == USED else f"left out: {says}".rstrip(": ") for case, (*_, says) in FILES.items()}
-    files = [(case, FILES[case][1], says) for case, says in states.items()]
+    by_result = dict[str, list[str]]()
+    for case, (*_, says) in FILES.items():
+        by_result.setdefault("used" if says == USED else f"left out: {says}".rstrip(": "), []).append(case)
     places, end = {name: name.upper() for name in ("here", "photos", "videos", "archives")}, "\n"
     commands = [(case, words.format(**places), code, says) for case, (words, code, says) in COMMANDS.items()]
     return f"""# Odd inputs and their results
 
-Each row is a test case of `tests/pipeline/test_odd_inputs.py`, which also checks this page.
+Each input is a test case of `tests/pipeline/test_odd_inputs.py`, which also checks this page.
 
 ## Files beside two good photos (exit code 0)
 
-| input | file name | result |
-|---|---|---|
-{"".join(f"| {case} | `{plain(name)}` | {plain(says)} |{end}" for case, name, says in files)}
+| inputs | result |
+|---|---|
+{"".join(f"| {', '.join(cases)} | {plain(says)} |{end}" for says, cases in by_result.items())}
 ## Refused inputs: one line and a hint
 
 | input | `sfm-app run` | exit code | the line contains |

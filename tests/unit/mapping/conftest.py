@@ -17,6 +17,7 @@ from sfm_app.colmap.joined_model import PlacedPhotos
 from sfm_app.geometry.epipolar import eight_point, fundamental_from_pose
 from sfm_app.geometry.poses import Similarity
 from sfm_app.mapping.joins import Fragment
+from sfm_app.plugins import load_plugins
 from sfm_app.progress import Progress
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
@@ -105,6 +106,7 @@ def run(synthetic, tmp_path):
         return SimpleNamespace(
             settings=Settings.from_mapping({"scene": scene}),
             workspace=Workspace(tmp_path),
+            plugins=load_plugins(installed=False),
             seed=0,
             workers=2,
             progress=Progress(),

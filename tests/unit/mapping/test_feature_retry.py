@@ -17,6 +17,7 @@ from sfm_app.mapping import feature_retry
 from sfm_app.mapping.attempt import Attempt, explained_pairs
 from sfm_app.mapping.feature_retry import OPTIONS, add_matches, candidate_pairs, find_finer_evidence, lost_photos
 from sfm_app.mapping.passes import Outcome
+from sfm_app.plugins import FeatureMethod, load_plugins
 from sfm_app.settings import Settings
 from sfm_app.types import Evidence, MatchedImage, MatchGraph, ViewGraph
 from tests.unit.mapping.fakes import EMPTY, hypothesis, without
@@ -35,7 +36,7 @@ def attempt_of(synthetic, evidence, placed):
 def first(synthetic, cameras, mapped, tmp_path):
     """Five of six photos placed; nothing is known of the matches of the last."""
     evidence = synthetic.evidence(cameras()).without([pair for pair in synthetic.matches.matches if LOST in pair])
-    with open_run(tmp_path / "out", Settings.from_mapping({"workers": 1}), None) as run:
+    with open_run(tmp_path / "out", Settings.from_mapping({"workers": 1, "plugins": False}), None) as run:
         run.workspace.root.mkdir(parents=True)
         best = mapped.best(cameras(), run.with_fingerprint("these"), attempt_of(synthetic, evidence, 5))
         yield replace(best, evidence=evidence)
@@ -96,9 +97,29 @@ def test_a_lost_photo_finds_its_place_by_finer_features(first, finer, retry):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("missing", "chosen", "places", "used"),
+    [
+        ("", "sift", 5, ["sift-affine", "net"]),
+        ("", "sift", 6, ["sift-affine"]),
+        ("no torch", "sift", 5, ["sift-affine"]),
+        ("", "sift-affine", 5, ["net"]),
+        ("", "net", 5, ["sift-affine"]),
+    ],
+)
+def test_features_of_a_plug_in_follow_while_a_photo_is_lost(first, finer, mapped, missing, chosen, places, used):
+    asked, built_in = finer(places), load_plugins(installed=False)
+    net = FeatureMethod("net", len, max, unavailable=lambda: missing)
+    plugins = replace(built_in, features={**built_in.features, "net": net})
+    run = replace(first.run, plugins=plugins, settings=Settings.from_mapping({"matching": {"features": chosen}}))
+    mapped.improve(replace(first, run=run), hypothesis("finer-features"))
+    assert [name for name, *_ in asked] == used
+
+
+@pytest.mark.slow
 def test_finer_features_add_matches_and_geometry(first, finer):
     finer()
-    evidence, run = find_finer_evidence(first, first.run)
+    evidence, run = find_finer_evidence(first, first.run.plugins.feature_method("sift-affine"), first.run)
     assert evidence.intrinsics is first.calibrated and run.workspace.root != first.run.workspace.root
     views, rows = evidence.views, evidence.matches.matches
     assert all((k, LOST) in views.fits and len(rows[k, LOST]) >= 100 for k in range(1, LOST))
@@ -111,7 +132,8 @@ def test_cameras_that_were_not_known_are_found_anew(first, finer, cameras, monke
     finer()
     monkeypatch.setattr(calibrating, "find_intrinsics", lambda *_: anew)
     guessed = replace(first, calibrated=cameras(method="guess", identifiable=False))
-    assert find_finer_evidence(guessed, first.run)[0].intrinsics is anew
+    method = first.run.plugins.feature_method("sift-affine")
+    assert find_finer_evidence(guessed, method, first.run)[0].intrinsics is anew
 
 
 def is_unchanged(found, first):
@@ -193,7 +215,7 @@ def test_few_lost_photos_of_many_are_left(count, lost, seen):
     images = {k: SimpleNamespace(image_id=k, has_pose=k <= count - lost) for k in range(1, count + 1)}
     models = (Attempt("incremental", SimpleNamespace(images=images), {}, ""),)
     best = Outcome(models, EMPTY, Evidence(photos(count), ViewGraph({}, {}), None), None, None)
-    assert len(lost_photos(best, SimpleNamespace(settings=Settings()))) == seen
+    assert len(lost_photos(best)) == seen
 
 
 GRID = np.array([[10.0 * k, 5.0] for k in range(4)])
