@@ -4,6 +4,7 @@ Each function has a fallback for macOS, Windows, and drives and containers with 
 OSError where the system refuses.
 """
 
+import _thread
 import contextlib
 import ctypes
 import math
@@ -329,6 +330,14 @@ def heed_requests_to_end() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def interrupt_main_thread() -> None:
+    """Do from another thread what Ctrl-C does: also a main thread that waits for a lock is woken."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    else:
+        _thread.interrupt_main(signal.SIGINT)
 
 
 def keep_handler() -> None:

@@ -196,6 +196,38 @@ def view(out: Path, port: int, host: str, no_browser: bool) -> None:
 
 
 @click.command()
+@click.argument("folder", type=PATH, default=Path("models"), required=False)
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port to listen on.  [default: a free one]")
+@click.option(
+    "--host", default="", help="Address to listen at for other machines (0.0.0.0: all); nothing is encrypted."
+)
+@click.option("--no-browser", is_flag=True, help="Only print the address.")
+def studio(folder: Path, port: int, host: str, no_browser: bool) -> None:
+    """Make models in the browser of this machine; FOLDER (models) holds them, until Ctrl-C.
+
+    What the page does, the command line can continue. With --host, telephones and other machines can use it, too:
+    whoever has the printed address, which contains a token. From there, put the name of this machine in the place of
+    127.0.0.1.
+    """
+    try:
+        from sfm_app.studio.server import serve_studio
+    except ModuleNotFoundError as err:
+        if err.name not in ("starlette", "uvicorn"):
+            raise
+        raise ConfigError(f"the studio needs {err.name}", hint="pip install 'sfm-app[studio]'") from None
+
+    def announce(address: str) -> None:
+        print_lines([f"{address} shows {folder}; stop with Ctrl-C"])
+        if host:
+            print_lines(["whoever reads the network can read along: there is no encryption"])
+        sys.stdout.flush()  # a program may wait for the address
+        if not no_browser:
+            open_browser(address)
+
+    serve_studio(folder, port, host, announce)
+
+
+@click.command()
 @click.argument("out", type=PATH)
 @click.option("--compare", type=PATH, help="Output folder of another run, for a comparison.")
 def report(out: Path, compare: Path | None) -> None:

@@ -27,6 +27,7 @@ FULL_DISK_ERRORS = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.EN
 SECTIONS: Mapping[str, Mapping[str, str]] = MappingProxyType({
     "Make a model": {
         "run": "Reconstruct a 3D model from a folder of photos or a video.",
+        "studio": "Do the same in the browser, without a terminal.",
         "calibrate": "Estimate the camera matrix of photos, without a model.",
         "markers": "Make a page of printable markers that set a model's size.",
         "demo": "Render photos of a known scene, reconstruct and compare.",
@@ -54,6 +55,7 @@ WELCOME = (
     "sfm-app turns uncalibrated photos into a 3D model.",
     "",
     "  sfm-app run PHOTOS   reconstruct a folder of photos or a video",
+    "  sfm-app studio       the same in your browser",
     "  sfm-app demo         try it on rendered photos, in a few minutes",
     "  sfm-app doctor       check this machine",
     "",

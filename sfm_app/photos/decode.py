@@ -2,6 +2,7 @@
 
 import ctypes
 import importlib
+import logging
 import re
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -27,6 +28,8 @@ from sfm_app.photos.files import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
 from sfm_app.types import CameraPrior, GpsPosition
 from sfm_app.types.arrays import BoolArray, ByteArray
 from sfm_app.types.photos import EXIF, SEA_LEVEL, TAKE_OFF
+
+logger = logging.getLogger("sfm_app")
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "PSD", "SGI", "PCX", "QOI", "TGA")
 """Formats that every Pillow can read; the last one, without a mark of its own, is tried last."""
@@ -704,3 +707,24 @@ def _unusual_jpeg(jpeg: _Jpeg) -> str:
     if jpeg.coding > 0xC4:
         return "a hierarchical JPEG"
     return f"a JPEG of {jpeg.frame[0]} bits" if jpeg.frame and jpeg.frame[0] == 12 else ""
+
+
+# Small pictures of photos, for pages.
+
+
+def small_jpeg(path: Path, side: int, *, upright: bool = False) -> bytes:
+    """Return a picture of a photo as JPEG, at most `side` pixels long; empty if the photo is unreadable.
+
+    With `upright`, it is turned as EXIF says.
+    """
+    try:
+        with Image.open(path) as image:
+            image.draft("RGB", (side, side))
+            small = undo_exif_orientation(image.convert("RGB"), orientation(image.getexif()) if upright else 1)
+            small.thumbnail((side, side))
+            file = BytesIO()
+            small.save(file, "JPEG", quality=72)
+    except (OSError, ValueError, Image.DecompressionBombError) as err:  # the photo may be gone
+        logger.info("no picture of %s", path.name, exc_info=err)
+        return b""
+    return file.getvalue()

@@ -1,18 +1,15 @@
 """Tables of the page: figures at a glance, warnings, cameras, pairs, stages, and a row per photo."""
 
-import io
 import logging
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
-
-from PIL import Image
 
 from sfm_app.camera.models import PARAMETERS
 from sfm_app.colmap.model import ModelFigures
+from sfm_app.photos.decode import small_jpeg
 from sfm_app.report.contents import RunContents, data_address
 from sfm_app.report.text import REMEDY, SOURCES, WARNING, duration_text, intrinsics_lines, result_lines
 from sfm_app.runtime.workspace import model_triangles
@@ -330,25 +327,10 @@ def embedded_pictures(contents: RunContents) -> Mapping[str, str]:
     """Return small pictures of all photos as data addresses, by name."""
     names, folder = photo_names(contents), contents.run.workspace.photos
     side = picture_side(max(len(names), 1))
-    jpegs = contents.run.map(lambda name: picture(folder / name, side), names, "pictures of the report")
+    jpegs = contents.run.map(lambda name: small_jpeg(folder / name, side), names, "pictures of the report")
     return {name: data_address("image/jpeg", jpeg) for name, jpeg in zip(names, jpegs, strict=True) if jpeg}
 
 
 def picture_side(count: int) -> int:
     """Return the longer side of each picture in pixels: all together stay small."""
     return int(min(max(math.sqrt(ALL_PIXELS / max(count, 1) * 4 / 3), SMALLEST_PX), LARGEST_PX))
-
-
-def picture(path: Path, side: int) -> bytes:
-    """Return a picture of a photo as JPEG, at most `side` pixels long; empty if the photo is unreadable."""
-    try:
-        with Image.open(path) as image:
-            image.draft("RGB", (side, side))
-            small = image.convert("RGB")
-            small.thumbnail((side, side))
-            file = io.BytesIO()
-            small.save(file, "JPEG", quality=72)
-    except (OSError, ValueError, Image.DecompressionBombError) as err:  # the photo may be gone
-        logger.info("no picture of %s", path.name, exc_info=err)
-        return b""
-    return file.getvalue()

@@ -117,7 +117,6 @@ def render_page(contents: RunContents, parts: LargeParts, other: RunContents | N
     model = _read_model(contents)
     rows = photo_rows(contents, model, parts.pictures)
     warnings, others = findings.remarks(contents)
-    photos = [{k: v for k, v in asdict(row).items() if k != "picture" and v is not None} for row in rows]
     page = _environment().get_template("page.html.jinja").render(
         title=contents.run.workspace.root.resolve().name,
         headline=headline(contents, rows),
@@ -139,10 +138,22 @@ def render_page(contents: RunContents, parts: LargeParts, other: RunContents | N
         depth_count=len(contents.counts("depth_maps").get("coverage", ())),
         view=parts.view is not None and bool(three_script()),
         served=parts.is_served,
-        data=script_data({"view": parts.view, "photos": photos}),
+        data=_page_data(parts.view, rows),
+        studio=False,
         three=Markup(three_script()),  # noqa: S704 - a script of an installed package, without user text
     )  # fmt: skip
     return page.encode("utf-8", "replace").decode("utf-8")  # names of files need not be text
+
+
+def render_view(view: Mapping[str, Json], rows: Sequence[PhotoRow]) -> str:
+    """Return the page of the 3D view alone, for the studio: its server has the scripts, points and models."""
+    page = _environment().get_template("studio_view.html.jinja").render(data=_page_data(view, rows), studio=True)
+    return page.encode("utf-8", "replace").decode("utf-8")
+
+
+def _page_data(view: Mapping[str, Json] | None, rows: Sequence[PhotoRow]) -> Markup:
+    photos = [{k: v for k, v in asdict(row).items() if k != "picture" and v is not None} for row in rows]
+    return script_data({"view": view, "photos": photos})
 
 
 def _read_model(contents: RunContents) -> ModelFigures | None:

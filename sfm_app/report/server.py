@@ -26,8 +26,9 @@ import numpy as np
 from sfm_app.errors import ConfigError
 from sfm_app.numerical import Json
 from sfm_app.operating_system import Ability, lacks
+from sfm_app.photos.decode import small_jpeg
 from sfm_app.report.contents import UNREADABLE, RunContents
-from sfm_app.report.findings import photo_names, picture
+from sfm_app.report.findings import photo_names
 from sfm_app.report.page import LargeParts, read_run, render_page
 from sfm_app.report.scene_view import MOST_GLB_BYTES, light_model, model_file, view_frame, view_points
 from sfm_app.runtime.context import RunContext
@@ -91,7 +92,7 @@ class RunResources:
     def page(self) -> bytes:
         """The page as HTML."""
         pictures = {name: f"pictures/{number}" for number, name in enumerate(self.names)}
-        return render_page(self.contents, LargeParts(pictures, self._view(), is_served=True)).encode("utf-8")
+        return render_page(self.contents, LargeParts(pictures, self.view(), is_served=True)).encode("utf-8")
 
     @cached_property
     def levels(self) -> list[bytes]:
@@ -132,14 +133,14 @@ class RunResources:
         if number >= len(self.names):
             return None
         side = SMALL_PX if kind == "pictures" else LARGE_PX
-        jpeg = picture(self.contents.run.workspace.photos / self.names[number], side)
+        jpeg = small_jpeg(self.contents.run.workspace.photos / self.names[number], side)
         return Resource(JPEG, jpeg) if jpeg else None
 
     def _is_large(self) -> bool:
         model = model_file(self.contents)
         return model is not None and model.stat().st_size > self.most_bytes
 
-    def _view(self) -> dict[str, Json] | None:
+    def view(self) -> dict[str, Json] | None:
         """Return the data of the 3D view, with addresses instead of model and points."""
         if self.points is None:
             return None

@@ -57,11 +57,12 @@
     byId("measured-a").textContent = a ? coordinates(a) : "–";
     byId("measured-b").textContent = b ? coordinates(b) : "–";
     byId("measured-length").textContent = b ? length(a.distanceTo(b)) : "–";
-    byId("measured-commands").hidden = !b;
+    if (byId("measured-commands")) byId("measured-commands").hidden = !b;
+    viewer.onMarks?.(marks);
     say.textContent = b
       ? `A and B are ${length(a.distanceTo(b))} apart.${on ? " Another click begins again." : ""}`
       : `Mark ${a ? "B" : "A"}: click or tap on the model. By keyboard: turn the view until the cross is there, and press Enter.`;
-    if (b) {
+    if (b && byId("measured-commands")) {
       const places = `"${coordinates(a)}" "${coordinates(b)}"`, out = view.out || folder();
       byId("out-stands").hidden = out !== "OUT";
       write("command-scale", `sfm-app run PHOTOS -o ${out} --scale "${inModel(a)}" "${inModel(b)}" 1.25m`);
@@ -76,13 +77,14 @@
   viewer.onDraw = () => {
     const [line, ...spots] = overlay.children, at = marks.map(viewer.project);
     spots.forEach((spot, k) => {
-      spot.style.display = at[k] ? "" : "none";
+      spot.setAttribute("display", at[k] ? "inline" : "none");
       if (at[k]) spot.setAttribute("transform", `translate(${at[k][0].toFixed(1)} ${at[k][1].toFixed(1)})`);
     });
     const both = at[0] && at[1];
-    line.style.display = both ? "" : "none";
+    line.setAttribute("display", both ? "inline" : "none");
     if (both) for (const [name, value] of [["x1", at[0][0]], ["y1", at[0][1]], ["x2", at[1][0]], ["y2", at[1][1]]]) line.setAttribute(name, value.toFixed(1));
   };
+  viewer.places = () => marks.map(inModel);
   viewer.onTap = (x, y) => {
     if (on) mark(x, y);
     return on;

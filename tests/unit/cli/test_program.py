@@ -78,7 +78,7 @@ def test_without_arguments_it_lists_the_first_commands():
     result = call()
     lines = result.stdout.splitlines()
     assert result.exit_code == 0 and result.stderr == "" and len(lines) <= 12 and max(map(len, lines)) <= 80
-    assert [line.split()[1] for line in lines if line.startswith("  sfm-app")] == ["run", "demo", "doctor"]
+    assert [line.split()[1] for line in lines if line.startswith("  sfm-app")] == ["run", "studio", "demo", "doctor"]
 
 
 def test_help_has_every_command():

@@ -1,0 +1,198 @@
+"""Projects: a folder each, which the command line can continue.
+
+A project has `project.json` (where its photos are, what is wanted), `settings.toml` (settings that differ from the
+defaults), `photos/` (what was uploaded), `removed/` (what the user took out), `model/` (output folder of the run),
+`exports/`, and `view/` (what the page shows; `worker` writes it).
+"""
+
+import filecmp
+import json
+import re
+import shlex
+import shutil
+import tomllib
+import unicodedata
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sfm_app.errors import ConfigError, InputError
+from sfm_app.files import read_object, replace_atomically
+from sfm_app.photos.files import is_video, list_photos, read_head
+from sfm_app.settings import Settings
+
+RECORD, SETTINGS, LIST = "project.json", "settings.toml", "photos.txt"
+PHOTOS, REMOVED, MODEL, VIEW, EXPORTS = "photos", "removed", "model", "view", "exports"
+IDLE, QUEUED, RUNNING, PAUSED = "idle", "queued", "running", "paused"
+"""What is wanted of a project: nothing, a run, the run that is at work, or a run that waits for the user."""
+UNSAFE = re.compile(r"[^\w.() +-]")
+LONGEST_NAME = 120
+"""Letters of a name; file systems take 255 bytes. Chosen by hand."""
+
+
+def safe_name(name: str, fallback: str) -> str:
+    """Return a name for a file or folder of ours: neither hidden, nor a path, nor HTML, nor too long."""
+    plain = UNSAFE.sub("_", unicodedata.normalize("NFC", name.replace("\\", "/").rpartition("/")[2])).strip(" .")
+    stem, dot, suffix = plain.rpartition(".")
+    if dot and len(suffix) <= 5:
+        return f"{stem[:LONGEST_NAME]}.{suffix}" if stem else fallback
+    return plain[:LONGEST_NAME] or fallback
+
+
+def toml_text(values: Mapping[str, Any]) -> str:
+    """Return nested values as TOML; JSON's texts, numbers and lists are TOML's."""
+    tables = {key: value for key, value in values.items() if isinstance(value, Mapping)}
+    lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in values.items() if key not in tables]
+    for key, table in tables.items():
+        lines += ["", f"[{key}]", toml_text(table).rstrip()]
+    return "\n".join(lines) + "\n"
+
+
+class Project:
+    """One project."""
+
+    def __init__(self, root: Path) -> None:
+        self.root, self.name = root, root.name
+        self.out, self.view, self.exports = root / MODEL, root / VIEW, root / EXPORTS
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """What `project.json` says."""
+        return read_object(self.root / RECORD)
+
+    def note(self, **values: Any) -> None:
+        """Change entries of `project.json`."""
+        with replace_atomically(self.root / RECORD) as path:
+            path.write_text(json.dumps(self.record | values, indent=1), encoding="utf-8", newline="\n")
+
+    @property
+    def wanted(self) -> str:
+        """What is wanted of it."""
+        return str(self.record.get("wanted", IDLE))
+
+    # photos
+
+    @property
+    def source(self) -> Path:
+        """Folder of its photos: of this machine, or its own."""
+        return Path(self.record.get("source") or self.root / PHOTOS)
+
+    @property
+    def is_linked(self) -> bool:
+        """Whether the photos lie in a folder of the user, which stays as it is."""
+        return bool(self.record.get("source"))
+
+    def photos(self) -> dict[str, str]:
+        """Return the names of files below the source, each with the reason why it is no photo, or ""."""
+        if not self.source.is_dir():
+            return {}
+        gone = set(self.record.get("removed", ()))
+        return {name: why for name, why in list_photos(self.source, self.out).items() if name not in gone}
+
+    def inputs(self) -> list[Path]:
+        """Return what a run reads: the folder, or every file where some are videos or archives."""
+        files = [self.source / name for name, why in self.photos().items() if not why]
+        mixed = not self.is_linked and any(zipfile.is_zipfile(file) or is_video(read_head(file)) for file in files)
+        return files if mixed else [self.source]
+
+    def place_for(self, name: str) -> Path:
+        """Return where an upload of this name goes; a name that is taken gets a number."""
+        place = self.root / PHOTOS / safe_name(name, "photo.jpg")
+        place.parent.mkdir(exist_ok=True)
+        stem, number = place.stem, 1
+        while place.exists():
+            number += 1
+            place = place.with_stem(f"{stem}-{number}")
+        return place
+
+    def keep(self, draft: Path, name: str) -> str:
+        """Move an uploaded file to the photos, unless the same is there; return its name."""
+        same = self.root / PHOTOS / safe_name(name, "photo.jpg")
+        if same.is_file() and filecmp.cmp(draft, same, shallow=False):
+            draft.unlink()
+            return same.name
+        place = self.place_for(name)
+        draft.replace(place)
+        return place.name
+
+    def remove(self, names: Sequence[str]) -> None:
+        """Take photos out of the project: uploads move to `removed/`, files of the user stay where they are."""
+        known = self.photos()
+        chosen = [name for name in names if name in known]
+        if self.is_linked:
+            self.note(removed=sorted({*self.record.get("removed", ()), *chosen}))
+            kept = [name for name, why in self.photos().items() if not why]
+            (self.root / LIST).write_text("".join(f"{name}\n" for name in kept), encoding="utf-8", newline="\n")
+            self.change("photos", "images", str(self.root / LIST))
+            return
+        (self.root / REMOVED).mkdir(exist_ok=True)
+        for name in chosen:
+            (self.source / name).replace(self.root / REMOVED / Path(name).name)
+
+    # settings
+
+    def settings(self) -> dict[str, Any]:
+        """Return the values of `settings.toml`; empty without one, ConfigError where it is no TOML."""
+        try:
+            return tomllib.loads((self.root / SETTINGS).read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError) as err:
+            raise ConfigError(f"{self.root / SETTINGS} cannot be read: {err}", hint="correct or remove it") from err
+
+    def change(self, table: str, key: str, value: Any) -> None:
+        """Set a value of `settings.toml`, in a table or with "" above all; ConfigError where it is invalid."""
+        values = self.settings()
+        (values.setdefault(table, {}) if table else values)[key] = value
+        Settings.from_mapping(values)
+        with replace_atomically(self.root / SETTINGS) as path:
+            path.write_text(toml_text(values), encoding="utf-8", newline="\n")
+
+    def command(self) -> str:
+        """Return the command that does the same as the page."""
+        inputs = " ".join(shlex.quote(str(path)) for path in (self.inputs() if self.is_linked else [self.source]))
+        every = "/*" if not self.is_linked and len(self.inputs()) > 1 else ""
+        config = f" --config {shlex.quote(str(self.root / SETTINGS))}" if (self.root / SETTINGS).exists() else ""
+        return f"sfm-app run {inputs}{every} -o {shlex.quote(str(self.out))}{config}"
+
+    def result(self) -> dict[str, Any]:
+        """Return what the worker has last found out about the photos and the model."""
+        return read_object(self.view / "result.json")
+
+
+class Projects:
+    """All projects in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def __iter__(self) -> Iterator[Project]:
+        for path in sorted(self.folder.iterdir(), key=lambda path: path.name.lower()):
+            if (path / RECORD).is_file():
+                yield Project(path)
+
+    def find(self, name: str) -> Project | None:
+        """Return the project of this name; names are compared, never made into paths."""
+        return next((project for project in self if project.name == name), None)
+
+    def create(self, name: str, source: str = "") -> Project:
+        """Make a project, whose photos are uploaded or lie in the folder `source`; InputError without that folder."""
+        folder = Path(source).expanduser() if source else None
+        if folder is not None and not (folder.is_absolute() and folder.is_dir()):
+            raise InputError(f"{source} is no folder of this machine", hint="give its whole path, from the root")
+        base = safe_name(name or (folder.name if folder else ""), "project").removesuffix(".")
+        taken = {path.name.lower() for path in self.folder.iterdir()}
+        number, chosen = 1, base
+        while chosen.lower() in taken:
+            number += 1
+            chosen = f"{base} {number}"
+        project = Project(self.folder / chosen)
+        project.root.mkdir()
+        project.note(source=str(folder.resolve()) if folder else "", wanted=IDLE)
+        return project
+
+    def delete(self, project: Project) -> None:
+        """Remove a project with all its files; a folder of the user stays."""
+        shutil.rmtree(project.root)

@@ -1,0 +1,190 @@
+"""A process of the studio: it does one job in a project, and prints its progress as lines of JSON.
+
+    python -m sfm_app.studio.worker run PROJECT
+    python -m sfm_app.studio.worker check PROJECT
+    python -m sfm_app.studio.worker export PROJECT FORMAT
+
+It ends as with Ctrl-C when its input ends: with the server, or because the server wants it to.
+"""
+
+import json
+import shutil
+import signal
+import sys
+import threading
+import time
+import zipfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from sfm_app.api import export_model, export_scene, open_run, reconstruct
+from sfm_app.errors import SfmError
+from sfm_app.files import replace_atomically
+from sfm_app.operating_system import heed_requests_to_end, interrupt_main_thread
+from sfm_app.pipeline import NAMES
+from sfm_app.plugins import load_plugins
+from sfm_app.progress import Step
+from sfm_app.report.findings import glance, photo_names, photo_rows, remarks
+from sfm_app.report.page import headline, read_run, render_view, three_script
+from sfm_app.report.scene_view import view_points
+from sfm_app.report.server import RunResources
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.cost_estimate import Plan, choose_plan, minutes_text
+from sfm_app.settings import QUALITY_PRESETS, Settings
+from sfm_app.studio.projects import Project
+
+EVERY_S = 0.25
+"""Seconds between two lines about the same work. Chosen by hand."""
+PLANNED = NAMES[1:]
+"""Stages whose costs are known once the photos are."""
+SHOWN_AFTER = ("depth_maps", "files")
+"""Stages before which the page gets a new view: the points are there, then the model is."""
+
+
+def say(**values: Any) -> None:
+    """Print a line for the server."""
+    print(json.dumps(values), flush=True)  # noqa: T201 - the server reads it
+
+
+class Reporter:
+    """Passes the progress of a run on, and writes the view of the page as soon as there is something to see."""
+
+    def __init__(self, project: Project, settings: Settings) -> None:
+        self.project, self.settings, self.last_s = project, settings, 0.0
+        self.plan: Plan | None = None
+        self.stage = ""
+
+    def __call__(self, step: Step) -> None:
+        """Pass a step on."""
+        begins = step.stage != self.stage
+        if begins:
+            self.stage = step.stage
+            if step.stage == NAMES[1]:
+                self.plan = _show(self.project, self.settings)
+            elif step.stage in SHOWN_AFTER:
+                _show(self.project, self.settings)
+        is_message = not begins and not step.total
+        now = time.monotonic()
+        if not begins and not is_message and step.done < step.total and now - self.last_s < EVERY_S:
+            return
+        self.last_s = now
+        more = {"message": step.label} if is_message else {"label": step.label, "done": step.done, "total": step.total}
+        say(stage=step.stage, minutes=self._minutes_left(step), **more)
+
+    def _minutes_left(self, step: Step) -> float | None:
+        if self.plan is None or step.stage not in PLANNED:
+            return None
+        share = step.done / step.total if step.total else 0.0
+        later = PLANNED[PLANNED.index(step.stage) + 1 :]
+        return self.plan.minutes(later) + (1 - share) * self.plan.minutes([step.stage])
+
+
+def _show(project: Project, settings: Settings) -> Plan | None:
+    """Write the view and the results of a project; return the plan of its run."""
+    with open_run(project.out, settings, None) as run:
+        plan = _write_view(project, run)
+    say(view=True)
+    return plan
+
+
+def _write_view(project: Project, run: RunContext) -> Plan | None:
+    contents = read_run(run)
+    resources = RunResources(contents, photo_names(contents), view_points(contents))
+    rows = photo_rows(contents, None, {})
+    photos = contents.photos.photos if contents.photos is not None else ()
+    plans = {
+        quality: choose_plan(photos, Settings.from_mapping({"quality": quality}), run.workers, run.memory_mb, PLANNED)
+        for quality in QUALITY_PRESETS
+    }  # fmt: skip
+    warnings, _ = remarks(contents)
+    result = {
+        "headline": headline(contents, rows),
+        "problem": contents.problem,
+        "warnings": warnings,
+        "facts": [asdict(fact) for fact in glance(contents)],
+        "photos": [{"name": row.name, "state": row.state, "reason": row.reason} for row in rows],
+        "names": resources.names,
+        "minutes": {quality: minutes_text(plan.minutes(PLANNED)) for quality, plan in plans.items()} if photos else {},
+        "has_view": resources.points is not None,
+        "has_model": "files" in contents.stages,
+    }
+    folder = project.view
+    (folder / "points").mkdir(parents=True, exist_ok=True)
+    for number, level in enumerate(resources.levels):
+        _write(folder / "points" / str(number), level)
+    view = resources.view()
+    if view is not None:
+        _write(folder / "three.js", three_script().encode("utf-8"))
+        _write(folder / "index.html", render_view(view, rows).encode("utf-8"))
+        light = resources.find("/light.glb")
+        if light is not None and isinstance(light.content, bytes):
+            _write(folder / "light.glb", light.content)
+    _write(folder / "result.json", json.dumps(result).encode("utf-8"))
+    return choose_plan(photos, run.settings, run.workers, run.memory_mb, PLANNED) if photos else None
+
+
+def _write(path: Path, data: bytes) -> None:
+    with replace_atomically(path) as draft:
+        draft.write_bytes(data)
+
+
+def run_project(project: Project, last: str) -> None:
+    """Run a project up to a stage."""
+    settings = Settings.from_mapping(project.settings())
+    try:
+        reconstruct(project.inputs(), project.out, settings, last=last, progress=Reporter(project, settings))
+    finally:
+        if (project.out / "manifest.json").exists():
+            _show(project, settings)
+
+
+def export_project(project: Project, file_format: str) -> None:
+    """Write the model in a format into `exports/`: one file, or a ZIP archive of several."""
+    target = project.exports / file_format
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir(parents=True)
+    if file_format in load_plugins().exporters:
+        files = list(export_model(project.out, file_format, target / f"{project.name}"))
+    else:
+        made = export_scene(project.out, file_format, target / "scene")
+        files = sorted(path for path in made.rglob("*") if path.is_file()) if made.is_dir() else [made]
+    if len(files) == 1:
+        say(file=files[0].relative_to(project.exports).as_posix())
+        return
+    archive = project.exports / f"{project.name}-{file_format}.zip"
+    with replace_atomically(archive) as draft, zipfile.ZipFile(draft, "w") as packed:
+        for file in files:
+            packed.write(file, file.relative_to(target))
+    shutil.rmtree(target)
+    say(file=archive.name)
+
+
+def _end_with_input() -> None:
+    sys.stdin.read()
+    interrupt_main_thread()
+
+
+def main(job: str, folder: str, *rest: str) -> int:
+    """Do a job; the last line says how it ended."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    project = Project(Path(folder))
+    try:
+        with heed_requests_to_end():
+            if job == "export":
+                export_project(project, *rest)
+            else:
+                run_project(project, NAMES[0] if job == "check" else NAMES[-1])
+    except KeyboardInterrupt:
+        say(end="stopped")
+        return 130
+    except SfmError as err:
+        say(end="failed", message=str(err), hint=err.hint)
+        return err.exit_code
+    say(end="done")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

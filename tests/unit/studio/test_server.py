@@ -1,0 +1,174 @@
+"""The server of the studio: who may ask, what uploads may do, and that names are never paths."""
+
+import http.client
+import json
+import socket
+import threading
+import time
+from urllib.parse import quote
+
+import numpy as np
+import pytest
+import uvicorn
+from PIL import Image
+
+from sfm_app.studio import server as studio_server
+from sfm_app.studio.server import make_app
+
+TOKEN = "a-token-of-this-test"  # noqa: S105
+
+
+class Client:
+    """Asks the studio as its page does, unless told otherwise."""
+
+    def __init__(self, port, folder):
+        self.port, self.folder = port, folder
+        self.usual = {"Host": f"127.0.0.1:{port}", "Cookie": f"sfm-app-studio-{port}={TOKEN}"}
+
+    def __call__(self, method, path, body=None, **headers):
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
+        asked = {name: value for name, value in (self.usual | headers).items() if value is not None}
+        data = json.dumps(body) if isinstance(body, dict) else body
+        connection.request(method, path, data, asked)
+        answer = connection.getresponse()
+        content = answer.read()
+        connection.close()
+        return answer, content
+
+    def json(self, *arguments):
+        answer, content = self(*arguments)
+        assert answer.status < 300, content
+        return json.loads(content)
+
+
+@pytest.fixture
+def ask(tmp_path):
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port = listener.getsockname()[1]
+        server = uvicorn.Server(uvicorn.Config(make_app(tmp_path / "models", TOKEN, port), log_level="error"))
+        thread = threading.Thread(target=server.run, args=([listener],))
+        thread.start()
+        while not server.started:
+            time.sleep(0.01)
+        yield Client(port, tmp_path / "models")
+        server.should_exit = True
+        thread.join()
+
+
+@pytest.fixture
+def photo(tmp_path):
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (90, 120, 3), np.uint8)).save(tmp_path / "photo.jpg")
+    return (tmp_path / "photo.jpg").read_bytes()
+
+
+@pytest.fixture
+def jug(ask):
+    assert ask.json("POST", "/api/projects", {"name": "jug"}) == {"name": "jug"}
+    return "/api/projects/jug"
+
+
+def test_the_token_of_the_address_becomes_a_cookie(ask):
+    answer, _ = ask("GET", f"/?token={TOKEN}", Cookie=None)
+    assert (answer.status, answer.getheader("Location")) == (303, "/")
+    cookie = answer.getheader("Set-Cookie")
+    assert "HttpOnly" in cookie and "SameSite=strict" in cookie
+    answer, content = ask("GET", "/", Cookie=cookie.partition(";")[0])
+    assert answer.status == 200 and b"studio.js" in content
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Cookie": None},
+        {"Cookie": "sfm-app-studio-1=" + TOKEN},
+        {"Host": "evil.example"},
+        {"Host": "evil.example:80"},
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+    ],
+)
+@pytest.mark.parametrize(("method", "path"), [("GET", "/"), ("GET", "/api/projects"), ("POST", "/api/projects")])
+def test_strangers_are_refused(ask, method, path, headers):
+    answer, content = ask(method, path, {"name": "x"} if method == "POST" else None, **headers)
+    assert answer.status == 403 and TOKEN.encode() not in content
+    assert not list(ask.folder.iterdir())
+
+
+def test_every_answer_forbids_scripts_and_frames_of_others(ask, jug):
+    for path in ("/", "/assets/studio.js", jug, "/api/nothing"):
+        answer, _ = ask("GET", path)
+        policy = answer.getheader("Content-Security-Policy")
+        assert "default-src 'none'" in policy and "script-src 'self';" in policy and "unsafe" not in policy
+        assert answer.getheader("X-Content-Type-Options") == "nosniff"
+
+
+@pytest.mark.parametrize(
+    "name", ["../../outside.jpg", "..%2f..%2foutside.jpg", "<img src=x onerror=alert(1)>.jpg", "a\0b.jpg"]
+)
+def test_names_of_uploads_are_never_paths_nor_markup(ask, jug, photo, name):
+    kept = ask.json("PUT", f"{jug}/files/{quote(name, safe='')}", photo)["name"]
+    assert (ask.folder / "jug" / "photos" / kept).read_bytes() == photo
+    assert not set(kept) & set("<>/\\\0")
+    assert [path.name for path in ask.folder.parent.rglob("*.jpg")] in ([kept, "photo.jpg"], ["photo.jpg", kept])
+    answer, content = ask("GET", f"{jug}/photos/{quote(kept)}")
+    assert answer.getheader("Content-Type") == "image/jpeg" and content[:2] == b"\xff\xd8"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/api/projects/..", "/api/projects/%2e%2e%2fmodels", "/api/projects/jug/photos/..%2fproject.json",
+        "/api/projects/jug/view/points/..%2fresult.json", "/api/projects/jug/view/pictures/99",
+        "/api/projects/jug/exports/..%2fproject.json", "/assets/..%2fserver.py", "/shared/../server.py",
+    ],
+)  # fmt: skip
+def test_nothing_outside_has_an_address(ask, jug, path):
+    answer, _ = ask("GET", path)
+    assert answer.status in (404, 405)
+
+
+def test_an_upload_that_does_not_fit_on_the_disk_is_refused(ask, jug, monkeypatch):
+    monkeypatch.setattr(studio_server, "FREE_BYTES", 2**60)
+    answer, content = ask("PUT", f"{jug}/files/a.jpg", b"a photo")
+    assert answer.status == 507 and b"disk is full" in content
+    assert not list(ask.folder.rglob("*.jpg")) and not list(ask.folder.rglob(".upload*"))
+
+
+def test_an_upload_without_a_size_is_refused(ask, jug):
+    answer, _ = ask("PUT", f"{jug}/files/a.jpg", iter([b"a", b"b"]))
+    assert answer.status == 411 and not list(ask.folder.rglob("*.jpg"))
+
+
+@pytest.mark.parametrize("body", [b"no JSON", b"[]", b"3"])
+def test_a_request_that_is_no_object_is_an_error(ask, jug, body):
+    answer, content = ask("PATCH", jug, body)
+    assert answer.status == 400 and b"message" in content
+
+
+def test_a_wrong_setting_is_an_error_that_says_so(ask, jug):
+    answer, content = ask("PATCH", jug, {"quality": "best"})
+    assert answer.status == 400 and "quality" in json.loads(content)["message"]
+    assert ask.json("GET", jug)["quality"] == "normal"
+
+
+def test_photos_are_listed_and_can_be_taken_out(ask, jug, photo):
+    for name in ("a.jpg", "b.jpg"):
+        ask.json("PUT", f"{jug}/files/{name}", photo + name.encode())
+    ask.json("DELETE", f"{jug}/photos", {"names": ["a.jpg"]})
+    assert [row["name"] for row in ask.json("GET", f"{jug}/photos")] == ["b.jpg"]
+    assert ask.json("GET", jug)["photos"] == 1
+
+
+def test_ten_thousand_files_are_listed_in_time(ask, jug):
+    folder = ask.folder / "jug" / "photos"
+    folder.mkdir()
+    for number in range(10_000):
+        (folder / f"{number}.jpg").touch()
+    assert len(ask.json("GET", f"{jug}/photos")) == 10_000
+
+
+def test_a_project_is_deleted_with_its_files(ask, jug, photo):
+    ask.json("PUT", f"{jug}/files/a.jpg", photo)
+    ask.json("DELETE", jug)
+    assert ask.json("GET", "/api/projects") == [] and not list(ask.folder.iterdir())
