@@ -31,6 +31,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from sfm_app.errors import ConfigError, SfmError
+from sfm_app.operating_system import Ability, lacks
 from sfm_app.photos.decode import small_jpeg
 from sfm_app.studio.jobs import Jobs, Progress
 from sfm_app.studio.projects import IDLE, MODEL, PAUSED, QUEUED, RUNNING, VIEW, Project, Projects
@@ -374,8 +375,11 @@ def serve_studio(folder: Path, port: int, host: str, started: Callable[[str], No
     token, place = secrets.token_urlsafe(), host or LOOPBACK
     family = socket.AF_INET6 if ":" in place else socket.AF_INET
     with socket.socket(family) as listener:
+        if not lacks(Ability.REUSED_PORTS):  # a restart may take the port of before
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((place, port))
+            listener.listen()  # a browser may be faster than the rest
         except (OSError, OverflowError) as err:
             raise ConfigError(
                 f"cannot listen at {place}, port {port}: {err}", hint="leave the port out for a free one"
