@@ -12,20 +12,21 @@ import shlex
 import shutil
 import tomllib
 import unicodedata
-import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.files import read_object, replace_atomically
-from sfm_app.photos.files import is_video, list_photos, read_head
+from sfm_app.photos.files import EXTENSIONS, list_photos
 from sfm_app.settings import Settings
 
 RECORD, SETTINGS, LIST = "project.json", "settings.toml", "photos.txt"
 PHOTOS, REMOVED, MODEL, VIEW, EXPORTS = "photos", "removed", "model", "view", "exports"
 IDLE, QUEUED, RUNNING, PAUSED = "idle", "queued", "running", "paused"
 """What is wanted of a project: nothing, a run, the run that is at work, or a run that waits for the user."""
+APART = (*EXTENSIONS, ".zip")
+"""Suffixes of files that a run reads only if they are named one by one."""
 UNSAFE = re.compile(r"[^\w.() +-]")
 LONGEST_NAME = 120
 """Letters of a name; file systems take 255 bytes. Chosen by hand."""
@@ -90,11 +91,11 @@ class Project:
         gone = set(self.record.get("removed", ()))
         return {name: why for name, why in list_photos(self.source, self.out).items() if name not in gone}
 
-    def inputs(self) -> list[Path]:
+    def inputs(self, photos: Mapping[str, str] | None = None) -> list[Path]:
         """Return what a run reads: the folder, or every file where some are videos or archives."""
-        files = [self.source / name for name, why in self.photos().items() if not why]
-        mixed = not self.is_linked and any(zipfile.is_zipfile(file) or is_video(read_head(file)) for file in files)
-        return files if mixed else [self.source]
+        listed = self.photos() if photos is None else photos
+        files = [self.source / name for name, why in listed.items() if not why]
+        return files if not self.is_linked and any(file.suffix.lower() in APART for file in files) else [self.source]
 
     def place_for(self, name: str) -> Path:
         """Return where an upload of this name goes; a name that is taken gets a number."""
@@ -149,12 +150,11 @@ class Project:
         with replace_atomically(self.root / SETTINGS) as path:
             path.write_text(toml_text(values), encoding="utf-8", newline="\n")
 
-    def command(self) -> str:
+    def command(self, photos: Mapping[str, str] | None = None) -> str:
         """Return the command that does the same as the page."""
-        inputs = " ".join(shlex.quote(str(path)) for path in (self.inputs() if self.is_linked else [self.source]))
-        every = "/*" if not self.is_linked and len(self.inputs()) > 1 else ""
+        inputs = shlex.quote(str(self.source)) + ("/*" if self.inputs(photos) != [self.source] else "")
         config = f" --config {shlex.quote(str(self.root / SETTINGS))}" if (self.root / SETTINGS).exists() else ""
-        return f"sfm-app run {inputs}{every} -o {shlex.quote(str(self.out))}{config}"
+        return f"sfm-app run {inputs} -o {shlex.quote(str(self.out))}{config}"
 
     def result(self) -> dict[str, Any]:
         """Return what the worker has last found out about the photos and the model."""

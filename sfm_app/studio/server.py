@@ -134,14 +134,16 @@ class Studio:
         """Return a project: its state, progress, results and settings."""
         project = self.project(request)
         shown, result, settings = self.jobs.progress.get(project.name, Progress()), project.result(), project.settings()
+        photos = project.photos()
         return JSONResponse({
             "name": project.name, "state": project.wanted, "source": str(project.source) if project.is_linked else "",
-            "folder": str(project.root), "quality": settings.get("quality", "normal"), "command": project.command(),
+            "folder": str(project.root), "quality": settings.get("quality", "normal"),
+            "command": project.command(photos),
             "markers": settings.get("scale", {}).get("markers", ""),
             "sizes": settings.get("scale", {}).get("distances", []),
             "stage": shown.stage, "label": shown.label, "done": shown.done, "total": shown.total,
             "minutes_left": shown.minutes, "views": shown.views, "messages": [*shown.messages],
-            "failure": shown.failure, "hint": shown.hint, "photos": len(project.photos()),
+            "failure": shown.failure, "hint": shown.hint, "photos": len(photos),
             **{key: result.get(key) for key in RESULTS},
         })  # fmt: skip
 

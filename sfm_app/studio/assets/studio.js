@@ -283,12 +283,25 @@ class ProjectPage {
   fillPhotos(rows, state, working) {
     const used = rows.filter((row) => row.state !== "left out").length;
     this.parts.photoLine.replaceChildren(...[rows.length ? texts.count(used, rows.length) : "", state.source ? texts.linked(state.source) : "", state.has_view ? texts.added : ""].filter(Boolean).map((text) => make("span", {}, `${text} `)));
-    this.parts.photos.replaceChildren(...rows.map((row) => make(
-      "li", { className: row.reason ? "odd" : "" },
-      make("img", { loading: "lazy", alt: "", src: `/api/projects${this.at}/photos${path(row.name)}` }),
-      make("b", {}, row.name), make("small", {}, [texts.photoStates[row.state] ?? row.state, row.reason].filter(Boolean).join(": ")),
-      working ? null : make("button", { type: "button", "aria-label": texts.removeOf(row.name), title: texts.remove, onclick: async () => { await ask("DELETE", `${this.at}/photos`, { names: [row.name] }); this.refresh(); } }, "×"),
-    )));
+    // items that say the same stay: there may be hundreds
+    const before = new Map([...this.parts.photos.children].map((item) => [item.dataset.key, item]));
+    const item = (row) => {
+      const key = JSON.stringify([row, working]);
+      return before.get(key) ?? make(
+        "li", { className: row.reason ? "odd" : "", "data-key": key },
+        make("img", { loading: "lazy", alt: "", src: `/api/projects${this.at}/photos${path(row.name)}` }),
+        make("b", {}, row.name), make("small", {}, [texts.photoStates[row.state] ?? row.state, row.reason].filter(Boolean).join(": ")),
+        working ? null : make("button", { type: "button", "aria-label": texts.removeOf(row.name), title: texts.remove, onclick: () => this.remove(row.name) }, "×"),
+      );
+    };
+    const wanted = rows.map(item), kept = new Set(wanted);
+    for (const one of before.values()) if (!kept.has(one)) one.remove();
+    wanted.forEach((one, k) => { if (this.parts.photos.children[k] !== one) this.parts.photos.insertBefore(one, this.parts.photos.children[k] ?? null); });
+  }
+
+  async remove(name) {
+    await ask("DELETE", `${this.at}/photos`, { names: [name] });
+    this.refresh();
   }
 
   async delete() {
