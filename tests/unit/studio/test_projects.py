@@ -84,6 +84,7 @@ def test_removed_uploads_are_kept_aside(projects):
     project.remove(["a.jpg", "../project.json"])
     assert sorted(project.photos()) == ["b.jpg"]
     assert (project.root / "removed" / "a.jpg").read_bytes() == b"a photo"
+    assert (project.root / "project.json").is_file()
 
 
 def test_a_folder_of_the_user_stays_as_it_is(projects, tmp_path):

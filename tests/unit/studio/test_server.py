@@ -128,6 +128,14 @@ def test_nothing_outside_has_an_address(ask, jug, path):
     assert answer.status in (404, 405)
 
 
+def test_a_photo_outside_of_the_project_is_not_shown(ask, jug, photo):
+    ask.json("PUT", f"{jug}/files/a.jpg", photo)
+    place = ask.folder / "jug" / "photos" / ".." / ".." / ".." / "photo.jpg"
+    assert place.resolve().read_bytes() == photo
+    answer, _ = ask("GET", f"{jug}/photos/..%2f..%2f..%2fphoto.jpg")
+    assert answer.status == 404
+
+
 def test_an_upload_that_does_not_fit_on_the_disk_is_refused(ask, jug, monkeypatch):
     monkeypatch.setattr(studio_server, "FREE_BYTES", 2**60)
     answer, content = ask("PUT", f"{jug}/files/a.jpg", b"a photo")
