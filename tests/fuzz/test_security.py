@@ -28,10 +28,13 @@ CALLS_ITS_OWN_PROCESS = Path(sfm_app.__file__).parent / "colmap/worker_process.p
 """Sends calls to a process that it started, through a pipe, and takes their results."""
 SERVES_MODELS = Path(sfm_app.__file__).parent / "report/server.py"
 """Listens on 127.0.0.1, or where the user says, to those who have the token."""
+SERVES_PROJECTS = Path(sfm_app.__file__).parent / "studio/server.py"
+"""As above."""
 KNOWN = {
     UNPICKLES_WHAT_IT_SENT: ["imports pickle"],
     CALLS_ITS_OWN_PROCESS: ["imports pickle"],
     SERVES_MODELS: ["imports socket", "imports http", "imports http.server", "imports urllib.parse"],
+    SERVES_PROJECTS: ["imports socket", "imports urllib.parse"],
 }
 RUNS_TEXT = {"eval", "exec", "compile", "__import__", "breakpoint", "os.system", "os.popen", "os.startfile"}
 
