@@ -4,6 +4,8 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple, TypeVar
 
 Item = TypeVar("Item")
+UP_TO_DATE = "up to date"
+"""Note of a stage that is skipped."""
 
 
 class Progress:

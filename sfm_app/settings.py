@@ -264,6 +264,11 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path} is not a TOML file: {err}", hint=hint) from err
 
 
+def toml_value(value: object) -> str:
+    """Return a text, number, truth or list as TOML: JSON, but for letters that it escapes in pairs, and DEL."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
 def toml_lines(section: BaseModel, table: str = "") -> Iterator[str]:
     """Yield the lines of a settings file, with the help of each setting as a comment; the top table has no name."""
     fields = type(section).model_fields
@@ -272,7 +277,7 @@ def toml_lines(section: BaseModel, table: str = "") -> Iterator[str]:
         yield f"\n# {(section.__doc__ or '').strip()}\n[{table}]"
     for name, info in fields.items():
         if name not in tables:
-            yield f"# {info.description}\n{name} = {json.dumps(getattr(section, name))}"
+            yield f"# {info.description}\n{name} = {toml_value(getattr(section, name))}"
     for name in tables:
         yield from toml_lines(getattr(section, name), name)
 

@@ -217,9 +217,12 @@ def studio(folder: Path, port: int, host: str, no_browser: bool) -> None:
         raise ConfigError(f"the studio needs {err.name}", hint="pip install 'sfm-app[studio]'") from None
 
     def announce(address: str) -> None:
-        print_lines([f"{address} shows {folder}; stop with Ctrl-C"])
+        print_lines([f"{address} shows the projects in {folder.resolve()}; stop with Ctrl-C"])
         if host:
-            print_lines(["whoever reads the network can read along: there is no encryption"])
+            print_lines([
+                "on other devices, the name or address of this machine stands in the place of 127.0.0.1",
+                "whoever reads the network can read along: there is no encryption",
+            ])  # fmt: skip
         sys.stdout.flush()  # a program may wait for the address
         if not no_browser:
             open_browser(address)

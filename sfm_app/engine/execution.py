@@ -27,6 +27,7 @@ from sfm_app.files import fingerprint
 from sfm_app.jit import warming_up
 from sfm_app.operating_system import ChildTimes, cpu_seconds
 from sfm_app.photos.source import Source
+from sfm_app.progress import UP_TO_DATE
 from sfm_app.runtime.context import Earlier, RunContext
 from sfm_app.runtime.cost_estimate import choose_plan
 from sfm_app.runtime.parallel import cpu_seconds_elsewhere
@@ -229,7 +230,7 @@ class _Execution:
     def run_stage(self, stage: Stage[Product], again: str | None, run: RunContext) -> None:
         """Run a stage and enter it in the manifest, unless it is up to date (`again` is None)."""
         if again is None:
-            run.progress.stage(stage.name, "up to date")
+            run.progress.stage(stage.name, UP_TO_DATE)
             return
         self.pipeline.forget(stage.name, run)
         run.progress.stage(stage.name, f"again: {again}" if again else "")

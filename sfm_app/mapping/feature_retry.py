@@ -77,7 +77,7 @@ def _drop_repeats(rows: Rows) -> Rows:
     return rows[first[0] & first[1]]
 
 
-FEATURES = "features"
+FOLDER, FEATURES = "finer", "features"
 
 
 def finer_methods(run: RunContext) -> list[FeatureMethod]:
@@ -127,7 +127,7 @@ def find_finer_evidence(best: Outcome, method: FeatureMethod, run: RunContext) -
     looser = matching.model_copy(update={"max_ratio": max(OPTIONS.max_ratio, matching.max_ratio)})
     run = replace(
         run,
-        workspace=SubWorkspace(run.workspace, method.name),
+        workspace=SubWorkspace(run.workspace, f"{FOLDER}-{method.name}"),
         settings=run.settings.model_copy(update={"matching": looser}),
         statistics={},
     )

@@ -717,6 +717,7 @@ def small_jpeg(path: Path, side: int, *, upright: bool = False) -> bytes:
 
     With `upright`, it is turned as EXIF says.
     """
+    formats()  # so that Pillow knows HEIC, where it can
     try:
         with Image.open(path) as image:
             image.draft("RGB", (side, side))

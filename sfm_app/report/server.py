@@ -1,6 +1,5 @@
 """`sfm-app view`: a server for the browsers of this machine, or for all who have its token."""
 
-import errno
 import hmac
 import io
 import logging
@@ -23,12 +22,12 @@ from urllib.parse import parse_qs
 
 import numpy as np
 
-from sfm_app.errors import ConfigError
 from sfm_app.numerical import Json
 from sfm_app.operating_system import Ability, lacks
 from sfm_app.photos.decode import small_jpeg
 from sfm_app.report.contents import UNREADABLE, RunContents
 from sfm_app.report.findings import photo_names
+from sfm_app.report.listening import HEADERS, LOOPBACK, explain_ports, page_address
 from sfm_app.report.page import LargeParts, read_run, render_page
 from sfm_app.report.scene_view import MOST_GLB_BYTES, light_model, model_file, view_frame, view_points
 from sfm_app.runtime.context import RunContext
@@ -166,15 +165,8 @@ def read_resources(run: RunContext) -> RunResources:
 # scripts would read the answers: so requests have to name the loopback address as their host. At another address, any
 # name may be right, and every request has to bring the token: first in its query, then in the cookie of the answer.
 
-LOOPBACK = "127.0.0.1"
-HEADERS = {
-    "Cache-Control": "no-store",
-    "Content-Security-Policy": "frame-ancestors 'none'",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-}
-"""Of every answer: no other page may embed or read it, and browsers do not keep it."""
+FORBID_FRAMES = {"Content-Security-Policy": "frame-ancestors 'none'"}
+"""No other page may embed an answer."""
 
 RANGE = re.compile(r"bytes=([0-9]{0,99})-([0-9]{0,99})", re.IGNORECASE)
 
@@ -210,9 +202,9 @@ class ViewServer(ThreadingTCPServer):
     @property
     def address(self) -> str:
         """Address of the page, with the token; that of this machine if it listens at all addresses."""
-        host = {"0.0.0.0": LOOPBACK, "::": "::1"}.get(str(self.server_address[0]), self.host)  # noqa: S104
-        name = f"[{host}]" if ":" in host else host
-        return f"http://{name}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+        # a name that the user gave stays, unless it stands for all addresses
+        listens = str(self.server_address[0])
+        return page_address(listens if listens in ("0.0.0.0", "::") else self.host, self.port, self.token)  # noqa: S104
 
     @property
     def cookie(self) -> str:
@@ -277,7 +269,7 @@ class ViewHandler(BaseHTTPRequestHandler):
 
     def _send(self, status: HTTPStatus, resource: Resource, more: dict[str, str]) -> None:
         content = resource.content
-        headers = {**HEADERS, **more, "Content-Type": resource.kind, "Accept-Ranges": "bytes"}
+        headers = {**HEADERS, **FORBID_FRAMES, **more, "Content-Type": resource.kind, "Accept-Ranges": "bytes"}
         with content.open("rb") if isinstance(content, Path) else io.BytesIO(content) as file:
             if isinstance(content, Path):
                 state = os.fstat(file.fileno())
@@ -305,18 +297,8 @@ class ViewHandler(BaseHTTPRequestHandler):
 
 def open_server(resources: RunResources, port: int = 0, host: str = "") -> ViewServer:
     """Start to listen, and return the server; port 0 is any free one, ConfigError for one that cannot be used."""
-    try:
+    with explain_ports(host or LOOPBACK, port):
         return ViewServer(resources, port, host)
-    except (OSError, OverflowError, UnicodeError) as err:  # Unicode: a name with an empty part
-        reason, hint = f"port {port} cannot be used: {err}", "leave the port out for a free one"
-        if isinstance(err, OSError) and err.errno in (errno.EADDRINUSE, errno.EACCES):
-            reason = f"port {port} is taken ({err.strerror})"
-        elif not isinstance(err, OverflowError):
-            reason, hint = (
-                f"cannot listen at {host or LOOPBACK}: {err}",
-                "give an address of this machine, or 0.0.0.0 for all",
-            )
-        raise ConfigError(reason, hint=hint) from err
 
 
 def serve_run(run: RunContext, port: int, started: Callable[[str], None], host: str = "") -> None:

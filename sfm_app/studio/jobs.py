@@ -3,18 +3,21 @@
 import asyncio
 import contextlib
 import json
+import subprocess
 import sys
 from collections import defaultdict, deque
-from collections.abc import AsyncIterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from subprocess import PIPE
+from typing import IO, Any, cast
 
+from sfm_app.operating_system import end_group, group_options
 from sfm_app.studio.projects import IDLE, QUEUED, RUNNING, Project, Projects
 
 PATIENCE_S = 30.0
 """Seconds that a process gets to end by itself; runs resume even after it is killed. Chosen by hand."""
-MOST_MESSAGES = 50
-"""Messages of a run that are kept for the page. Chosen by hand."""
+MOST_MESSAGES = 5
+"""Last messages of a run that the page shows. Chosen by hand."""
 
 
 @dataclass
@@ -22,7 +25,6 @@ class Progress:
     """What the page shows of the run of a project."""
 
     stage: str = ""
-    label: str = ""
     done: int = 0
     total: int = 0
     minutes: float | None = None
@@ -41,7 +43,7 @@ class Progress:
             self.failure, self.hint = str(line["message"]), str(line["hint"])
         if "message" in line and "stage" in line:
             self.messages.append(str(line["message"]))
-        for name in ("stage", "label", "done", "total", "minutes"):
+        for name in ("stage", "done", "total", "minutes"):
             if name in line:
                 setattr(self, name, line[name])
 
@@ -54,13 +56,14 @@ class Jobs:
         self.changed = asyncio.Event()
         self.locks = defaultdict[str, asyncio.Lock](asyncio.Lock)
         """By project: only one process works in it."""
-        self.process: asyncio.subprocess.Process | None = None
+        self.run: asyncio.Task[None] | None = None
         self.running = ""
         """Name of the project whose run is at work."""
 
     async def work(self) -> None:
         """Run what is queued until it is canceled; what an ended server was running comes first."""
         for project in self.projects:
+            project.forget_uploads()
             if project.wanted == RUNNING:
                 project.note(wanted=QUEUED, queued=0)
         while True:
@@ -81,17 +84,25 @@ class Jobs:
     def stop(self, project: Project, wanted: str = IDLE) -> None:
         """End the run of a project, or take it out of the queue; it resumes when it is started again."""
         project.note(wanted=wanted)
-        if project.name == self.running and self.process is not None and self.process.stdin is not None:
-            self.process.stdin.close()
+        if project.name == self.running and self.run is not None:
+            self.run.cancel()
+
+    def is_at_work(self, project: Project) -> bool:
+        """Return whether a process works in a project."""
+        return project.name == self.running or self.locks[project.name].locked()
 
     async def _run(self, project: Project) -> None:
         project.note(wanted=RUNNING)
+        self.run = run = asyncio.create_task(self._follow("run", project))
         self.running = project.name
         try:
-            await self._follow("run", project)
-        finally:
+            await asyncio.wait([run])
+        finally:  # the studio ends, or the run has
+            run.cancel()
+            await asyncio.wait([run])
             self.running = ""
-        if project.root.is_dir() and project.wanted == RUNNING:
+        if not run.cancelled():
+            run.result()  # an error of ours
             project.note(wanted=IDLE)
 
     async def check(self, project: Project) -> None:
@@ -101,46 +112,41 @@ class Jobs:
     async def _follow(self, job: str, project: Project) -> None:
         async with self.locks[project.name]:
             shown = self.progress[project.name] = Progress()
-            async for line in self._lines(job, project):
-                shown.follow(line)
+            await _work(shown.follow, job, project)
 
     async def export(self, project: Project, file_format: str) -> dict[str, Any]:
-        """Write the model in another format; return the worker's line with the file, or with the failure."""
+        """Write the model in another format; return the file, or the failure."""
+        said = dict[str, Any]()
         async with self.locks[project.name]:
-            lines = [line async for line in self._lines("export", project, file_format)]
-        return {key: value for line in lines for key, value in line.items()}
+            await _work(said.update, "export", project, file_format)
+        return said
 
-    async def _lines(self, job: str, project: Project, *rest: str) -> AsyncIterator[dict[str, Any]]:
-        """Start a worker and yield its lines; a worker that crashes ends with a failure."""
-        process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "sfm_app.studio.worker", job, str(project.root), *rest,
-            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
-            start_new_session=True, limit=2**22,
-        )  # fmt: skip
-        if job == "run":
-            self.process = process
-        assert process.stdout is not None and process.stderr is not None  # noqa: S101 - they are pipes
-        errors = asyncio.create_task(process.stderr.read())
-        ended = False
-        try:
-            async for text in process.stdout:
-                with contextlib.suppress(ValueError):  # a library may print
-                    line = json.loads(text)
-                    if isinstance(line, dict):
-                        ended |= "end" in line
-                        yield line
-            await process.wait()
-        finally:
-            await self._end(process)
-        if not ended:
-            last = (await errors).decode("utf-8", "replace").strip().rpartition("\n")[2]
-            message = f"the program has ended: {last or process.returncode}"
-            yield {"end": "failed", "message": message, "hint": "start it again: it resumes"}
 
-    async def _end(self, process: asyncio.subprocess.Process) -> None:
-        if process.returncode is None and process.stdin is not None:
-            process.stdin.close()
-            try:
-                await asyncio.wait_for(process.wait(), PATIENCE_S)
-            except TimeoutError:
-                process.kill()
+async def _work(follow: Callable[[dict[str, Any]], None], job: str, project: Project, *rest: str) -> None:
+    """Do a job in a worker and follow its lines; a worker that crashes ends with a failure."""
+    said, ended = project.root / "worker.txt", False
+    command = [sys.executable, "-m", "sfm_app.studio.worker", job, str(project.root), *rest]
+    with said.open("wb") as errors:
+        process = subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=errors, **group_options())  # noqa: S603 - our own
+    try:
+        while text := await asyncio.to_thread(cast(IO[bytes], process.stdout).readline):
+            with contextlib.suppress(ValueError):  # a library may print
+                line = json.loads(text)
+                if isinstance(line, dict):
+                    ended |= "end" in line
+                    follow(line)
+    finally:
+        await asyncio.shield(asyncio.to_thread(_end, process))
+    if not ended:
+        last = said.read_text(encoding="utf-8", errors="replace").strip().rpartition("\n")[2]
+        message = f"the program has ended: {last or process.returncode}"
+        follow({"end": "failed", "message": message, "hint": "start it again: it resumes"})
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Let a worker end by itself, which the end of its input asks for; kill it where it does not."""
+    cast(IO[bytes], process.stdin).close()
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(PATIENCE_S)
+    end_group(process, PATIENCE_S)
+    cast(IO[bytes], process.stdout).close()

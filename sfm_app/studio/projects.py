@@ -13,15 +13,16 @@ import shutil
 import tomllib
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.files import read_object, replace_atomically
 from sfm_app.photos.files import EXTENSIONS, list_photos
-from sfm_app.settings import Settings
+from sfm_app.settings import Settings, toml_value
 
-RECORD, SETTINGS, LIST = "project.json", "settings.toml", "photos.txt"
+RECORD, SETTINGS, LIST, DRAFT = "project.json", "settings.toml", "photos.txt", ".upload-"
 PHOTOS, REMOVED, MODEL, VIEW, EXPORTS = "photos", "removed", "model", "view", "exports"
 IDLE, QUEUED, RUNNING, PAUSED = "idle", "queued", "running", "paused"
 """What is wanted of a project: nothing, a run, the run that is at work, or a run that waits for the user."""
@@ -42,12 +43,20 @@ def safe_name(name: str, fallback: str) -> str:
 
 
 def toml_text(values: Mapping[str, Any]) -> str:
-    """Return nested values as TOML; JSON's texts, numbers and lists are TOML's."""
+    """Return nested values as TOML."""
     tables = {key: value for key, value in values.items() if isinstance(value, Mapping)}
-    lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in values.items() if key not in tables]
+    lines = [f"{key} = {toml_value(value)}" for key, value in values.items() if key not in tables]
     for key, table in tables.items():
         lines += ["", f"[{key}]", toml_text(table).rstrip()]
     return "\n".join(lines) + "\n"
+
+
+def move_beside(file: Path, place: Path) -> Path:
+    """Move a file to a place, with a number where that is taken; return where it is."""
+    place.parent.mkdir(exist_ok=True)
+    free = (place.with_stem(f"{place.stem}-{number}") for number in count(2))
+    chosen = place if not place.exists() else next(one for one in free if not one.exists())
+    return file.replace(chosen)
 
 
 class Project:
@@ -97,24 +106,13 @@ class Project:
         files = [self.source / name for name, why in listed.items() if not why]
         return files if not self.is_linked and any(file.suffix.lower() in APART for file in files) else [self.source]
 
-    def place_for(self, name: str) -> Path:
-        """Return where an upload of this name goes; a name that is taken gets a number."""
-        place = self.root / PHOTOS / safe_name(name, "photo.jpg")
-        place.parent.mkdir(exist_ok=True)
-        stem, number = place.stem, 1
-        while place.exists():
-            number += 1
-            place = place.with_stem(f"{stem}-{number}")
-        return place
-
     def keep(self, draft: Path, name: str) -> str:
         """Move an uploaded file to the photos, unless the same is there; return its name."""
-        same = self.root / PHOTOS / safe_name(name, "photo.jpg")
-        if same.is_file() and filecmp.cmp(draft, same, shallow=False):
+        place = self.root / PHOTOS / safe_name(name, "photo.jpg")
+        if place.is_file() and filecmp.cmp(draft, place, shallow=False):
             draft.unlink()
-            return same.name
-        place = self.place_for(name)
-        draft.replace(place)
+        else:
+            place = move_beside(draft, place)
         return place.name
 
     def remove(self, names: Sequence[str]) -> None:
@@ -127,9 +125,13 @@ class Project:
             (self.root / LIST).write_text("".join(f"{name}\n" for name in kept), encoding="utf-8", newline="\n")
             self.change("photos", "images", str(self.root / LIST))
             return
-        (self.root / REMOVED).mkdir(exist_ok=True)
         for name in chosen:
-            (self.source / name).replace(self.root / REMOVED / Path(name).name)
+            move_beside(self.source / name, self.root / REMOVED / Path(name).name)
+
+    def forget_uploads(self) -> None:
+        """Remove the files of uploads that a killed server has left."""
+        for draft in self.root.glob(f"{DRAFT}*"):
+            draft.unlink()
 
     # settings
 
@@ -155,6 +157,17 @@ class Project:
         inputs = shlex.quote(str(self.source)) + ("/*" if self.inputs(photos) != [self.source] else "")
         config = f" --config {shlex.quote(str(self.root / SETTINGS))}" if (self.root / SETTINGS).exists() else ""
         return f"sfm-app run {inputs} -o {shlex.quote(str(self.out))}{config}"
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return its photos: name, file, state, reason, and number in the model; a file may hold several."""
+        listed, known = self.photos(), self.result().get("photos", ())
+        rows = [row for row in known if row["file"] in listed]
+        whole, held = {row["name"] for row in rows}, {row["file"] for row in rows}
+        for name, why in listed.items():
+            if name not in whole:
+                state = "left out" if why else "read" if name in held else "new"
+                rows.append({"name": name, "file": name, "state": state, "reason": why})
+        return rows
 
     def result(self) -> dict[str, Any]:
         """Return what the worker has last found out about the photos and the model."""
@@ -184,11 +197,8 @@ class Projects:
             raise InputError(f"{source} is no folder of this machine", hint="give its whole path, from the root")
         base = safe_name(name or (folder.name if folder else ""), "project").removesuffix(".")
         taken = {path.name.lower() for path in self.folder.iterdir()}
-        number, chosen = 1, base
-        while chosen.lower() in taken:
-            number += 1
-            chosen = f"{base} {number}"
-        project = Project(self.folder / chosen)
+        names = chain([base], (f"{base} {number}" for number in count(2)))
+        project = Project(self.folder / next(one for one in names if one.lower() not in taken))
         project.root.mkdir()
         project.note(source=str(folder.resolve()) if folder else "", wanted=IDLE)
         return project

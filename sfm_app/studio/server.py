@@ -8,7 +8,6 @@ compared with the names of projects and photos, and never made into paths.
 import asyncio
 import contextlib
 import hmac
-import logging
 import mimetypes
 import secrets
 import shutil
@@ -30,23 +29,23 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from sfm_app.errors import ConfigError, SfmError
+from sfm_app.errors import SfmError
 from sfm_app.operating_system import Ability, lacks
 from sfm_app.photos.decode import small_jpeg
+from sfm_app.report.listening import HEADERS, LOOPBACK, explain_ports, page_address
 from sfm_app.studio.jobs import Jobs, Progress
-from sfm_app.studio.projects import IDLE, MODEL, PAUSED, QUEUED, RUNNING, VIEW, Project, Projects
-
-logger = logging.getLogger("sfm_app")
+from sfm_app.studio.projects import DRAFT, IDLE, MODEL, PAUSED, QUEUED, RUNNING, VIEW, Project, Projects
 
 ASSETS = Path(__file__).parent / "assets"
 SHARED = Path(__file__).parents[1] / "report" / "assets"
 """Styles and scripts of the report, which the studio uses, too."""
-LOOPBACK, LOCAL_NAMES = "127.0.0.1", ("127.0.0.1", "localhost", "[::1]")
+LOCAL_NAMES = (LOOPBACK, "localhost")
 FREE_BYTES = 2 * 2**30
 """Disk that uploads leave free: a run needs some. Chosen by hand."""
 SMALL_PX, LARGE_PX = 320, 2400
 """Longer sides of pictures in the list, and of those in the 3D view. Chosen by hand."""
 RESULTS = ("headline", "problem", "warnings", "facts", "minutes", "has_view", "has_model")
+STOPPED = {"pause": PAUSED, "cancel": IDLE}
 FORMATS = ("glb", "obj", "stl", "usdz", "ply", "laz", "splat", "blender")
 VIEW_FILES = {
     "": f"{VIEW}/index.html", "three.js": f"{VIEW}/three.js", "light.glb": f"{VIEW}/light.glb",
@@ -56,13 +55,6 @@ POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self' blob:; "
     "frame-src 'self'; frame-ancestors 'self'; base-uri 'none'; form-action 'self'"
 )
-HEADERS = {
-    "Cache-Control": "no-store",
-    "Content-Security-Policy": POLICY,
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-}
 
 
 class Gate:
@@ -127,7 +119,7 @@ class Studio:
         result = project.result()
         return {
             "name": project.name, "state": project.wanted, "headline": result.get("headline", ""),
-            "picture": result["names"][0] if result.get("names") else "",
+            "has_picture": bool(result.get("names")),
         }  # fmt: skip
 
     async def show(self, request: Request) -> Response:
@@ -141,7 +133,7 @@ class Studio:
             "command": project.command(photos),
             "markers": settings.get("scale", {}).get("markers", ""),
             "sizes": settings.get("scale", {}).get("distances", []),
-            "stage": shown.stage, "label": shown.label, "done": shown.done, "total": shown.total,
+            "stage": shown.stage, "done": shown.done, "total": shown.total,
             "minutes_left": shown.minutes, "views": shown.views, "messages": [*shown.messages],
             "failure": shown.failure, "hint": shown.hint, "photos": len(photos),
             **{key: result.get(key) for key in RESULTS},
@@ -149,14 +141,7 @@ class Studio:
 
     async def photos(self, request: Request) -> Response:
         """Return the photos of a project, each with its state and reason."""
-        project = self.project(request)
-        known = {row["name"]: row for row in project.result().get("photos", ())}
-        listed = project.photos()
-        rows = [
-            known.get(name) or {"name": name, "state": "left out" if why else "new", "reason": why}
-            for name, why in listed.items()
-        ]
-        return JSONResponse(rows)
+        return JSONResponse(self.project(request).rows())
 
     async def thumb(self, request: Request) -> Response:
         """Return a small picture of a photo."""
@@ -178,7 +163,7 @@ class Studio:
     async def delete(self, request: Request) -> Response:
         """Remove a project with its files."""
         project = self.project(request)
-        if project.wanted == RUNNING:
+        if self.jobs.is_at_work(project):
             raise HTTPException(409, "it is at work: stop it first")
         await run_in_threadpool(self.projects.delete, project)
         return JSONResponse({})
@@ -193,7 +178,7 @@ class Studio:
             raise HTTPException(411, "the size of the file is missing")
         if shutil.disk_usage(project.root).free < size + FREE_BYTES:
             raise HTTPException(507, "the disk is full: remove files or other projects")
-        draft = project.root / f".upload-{secrets.token_hex(8)}"
+        draft = project.root / f"{DRAFT}{secrets.token_hex(8)}"
         try:
             with draft.open("xb") as file:
                 async for part in request.stream():
@@ -241,8 +226,10 @@ class Studio:
         project, action = self.project(request), request.path_params["action"]
         if action == "start":
             self.jobs.start(project)
+        elif action in STOPPED:
+            self.jobs.stop(project, STOPPED[action])
         else:
-            self.jobs.stop(project, PAUSED if action == "pause" else IDLE)
+            raise HTTPException(404, "there is nothing at this address")
         return JSONResponse({})
 
     async def export(self, request: Request) -> Response:
@@ -324,7 +311,8 @@ def make_app(folder: Path, token: str, port: int, *, any_host: bool = False) -> 
         work = asyncio.create_task(studio.jobs.work())
         yield
         work.cancel()
-        await asyncio.wait([work])
+        with contextlib.suppress(asyncio.CancelledError):
+            await work
 
     at = "/api/projects/{project}"
     routes = [
@@ -349,7 +337,7 @@ def make_app(folder: Path, token: str, port: int, *, any_host: bool = False) -> 
     gate = Middleware(Gate, token=token, port=port, any_host=any_host)
     handlers: dict[Any, Any] = {HTTPException: _on_error, SfmError: _on_error, ValueError: _on_error}
     return Starlette(
-        routes=routes, middleware=[gate, Middleware(Headers)], exception_handlers=handlers, lifespan=lifespan
+        routes=routes, middleware=[Middleware(Headers), gate], exception_handlers=handlers, lifespan=lifespan
     )
 
 
@@ -365,7 +353,8 @@ class Headers:
         async def add(message: Any) -> None:
             if message["type"] == "http.response.start":
                 known = {name.lower() for name, _ in message["headers"]}
-                extra = {name.lower().encode(): value.encode() for name, value in (HEADERS).items()}
+                wanted = HEADERS | {"Content-Security-Policy": POLICY}
+                extra = {name.lower().encode(): value.encode() for name, value in wanted.items()}
                 message["headers"] += [(name, value) for name, value in extra.items() if name not in known]
             await send(message)
 
@@ -379,19 +368,14 @@ def serve_studio(folder: Path, port: int, host: str, started: Callable[[str], No
     with socket.socket(family) as listener:
         if not lacks(Ability.REUSED_PORTS):  # a restart may take the port of before
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
+        with explain_ports(place, port):
             listener.bind((place, port))
             listener.listen()  # a browser may be faster than the rest
-        except (OSError, OverflowError) as err:
-            raise ConfigError(
-                f"cannot listen at {place}, port {port}: {err}", hint="leave the port out for a free one"
-            ) from err
         used = listener.getsockname()[1]
         app = make_app(folder, token, used, any_host=bool(host))
         config = uvicorn.Config(
             app, log_level="warning", access_log=False, server_header=False, lifespan="on", timeout_graceful_shutdown=3
         )
-        shown = {"0.0.0.0": LOOPBACK, "::": "::1"}.get(place, place)  # noqa: S104 - an address to compare with
-        started(f"http://{f'[{shown}]' if ':' in shown else shown}:{used}/?token={token}")
+        started(page_address(place, used, token))
         with contextlib.suppress(KeyboardInterrupt):
             uvicorn.Server(config).run([listener])

@@ -8,10 +8,10 @@ It ends as with Ctrl-C when its input ends: with the server, or because the serv
 """
 
 import json
+import os
 import shutil
 import signal
 import sys
-import threading
 import time
 import zipfile
 from dataclasses import asdict
@@ -20,12 +20,12 @@ from typing import Any
 
 from sfm_app.api import export_model, export_scene, open_run, reconstruct
 from sfm_app.errors import SfmError
-from sfm_app.files import replace_atomically
-from sfm_app.operating_system import heed_requests_to_end, interrupt_main_thread
+from sfm_app.files import MANIFEST, replace_atomically, save_files
+from sfm_app.operating_system import heed_requests_to_end, interrupt_main_thread, watch_parent
 from sfm_app.pipeline import NAMES
 from sfm_app.plugins import load_plugins
-from sfm_app.progress import Step
-from sfm_app.report.findings import glance, photo_names, photo_rows, remarks
+from sfm_app.progress import UP_TO_DATE, Step
+from sfm_app.report.findings import PhotoRow, glance, photo_names, photo_rows, remarks
 from sfm_app.report.page import headline, read_run, render_view, three_script
 from sfm_app.report.scene_view import view_points
 from sfm_app.report.server import RunResources
@@ -38,8 +38,10 @@ EVERY_S = 0.25
 """Seconds between two lines about the same work. Chosen by hand."""
 PLANNED = NAMES[1:]
 """Stages whose costs are known once the photos are."""
-SHOWN_AFTER = ("depth_maps", "files")
-"""Stages before which the page gets a new view: the points are there, then the model is."""
+SHOWN_BEFORE = (NAMES[1], "depth_maps")
+"""Stages before which the page gets what is new: the photos, then the points; the model follows at the end."""
+LATE_MIN = 0.5
+"""Minutes beyond its plan from which on a stage is late. Chosen by hand."""
 
 
 def say(**values: Any) -> None:
@@ -50,39 +52,38 @@ def say(**values: Any) -> None:
 class Reporter:
     """Passes the progress of a run on, and writes the view of the page as soon as there is something to see."""
 
-    def __init__(self, project: Project, settings: Settings) -> None:
-        self.project, self.settings, self.last_s = project, settings, 0.0
+    def __init__(self, project: Project) -> None:
+        self.project, self.last_s, self.begun_s = project, 0.0, 0.0
         self.plan: Plan | None = None
         self.stage = ""
 
     def __call__(self, step: Step) -> None:
         """Pass a step on."""
-        begins = step.stage != self.stage
+        now, begins = time.monotonic(), step.stage != self.stage
         if begins:
-            self.stage = step.stage
-            if step.stage == NAMES[1]:
-                self.plan = _show(self.project, self.settings)
-            elif step.stage in SHOWN_AFTER:
-                _show(self.project, self.settings)
+            self.stage, self.begun_s = step.stage, now
+            if step.label != UP_TO_DATE and step.stage in SHOWN_BEFORE:
+                self.plan = _show(self.project)
         is_message = not begins and not step.total
-        now = time.monotonic()
         if not begins and not is_message and step.done < step.total and now - self.last_s < EVERY_S:
             return
         self.last_s = now
-        more = {"message": step.label} if is_message else {"label": step.label, "done": step.done, "total": step.total}
-        say(stage=step.stage, minutes=self._minutes_left(step), **more)
+        more = {"message": step.label} if is_message else {"done": step.done, "total": step.total}
+        say(stage=step.stage, minutes=self._minutes_left(step, now), **more)
 
-    def _minutes_left(self, step: Step) -> float | None:
+    def _minutes_left(self, step: Step, now: float) -> float | None:
+        """Return the planned minutes that are left; None where they are not known, or the stage takes longer."""
         if self.plan is None or step.stage not in PLANNED:
             return None
-        share = step.done / step.total if step.total else 0.0
-        later = PLANNED[PLANNED.index(step.stage) + 1 :]
-        return self.plan.minutes(later) + (1 - share) * self.plan.minutes([step.stage])
+        planned, spent = self.plan.minutes([step.stage]), (now - self.begun_s) / 60
+        if spent > planned + LATE_MIN:
+            return None
+        return self.plan.minutes(PLANNED[PLANNED.index(step.stage) + 1 :]) + max(0.0, planned - spent)
 
 
-def _show(project: Project, settings: Settings) -> Plan | None:
+def _show(project: Project) -> Plan | None:
     """Write the view and the results of a project; return the plan of its run."""
-    with open_run(project.out, settings, None) as run:
+    with open_run(project.out, Settings.from_mapping(project.settings()), None) as run:
         plan = _write_view(project, run)
     say(view=True)
     return plan
@@ -94,49 +95,55 @@ def _write_view(project: Project, run: RunContext) -> Plan | None:
     rows = photo_rows(contents, None, {})
     photos = contents.photos.photos if contents.photos is not None else ()
     plans = {
-        quality: choose_plan(photos, Settings.from_mapping({"quality": quality}), run.workers, run.memory_mb, PLANNED)
-        for quality in QUALITY_PRESETS
-    }  # fmt: skip
+        quality: choose_plan(
+            photos,
+            Settings.from_mapping(project.settings() | {"quality": quality}),
+            run.workers,
+            run.memory_mb,
+            PLANNED,
+        )
+        for quality in (QUALITY_PRESETS if photos else ())
+    }
     warnings, _ = remarks(contents)
     result = {
         "headline": headline(contents, rows),
         "problem": contents.problem,
         "warnings": warnings,
         "facts": [asdict(fact) for fact in glance(contents)],
-        "photos": [{"name": row.name, "state": row.state, "reason": row.reason} for row in rows],
+        "photos": [_photo(row, number, project) for number, row in enumerate(rows)],
         "names": resources.names,
-        "minutes": {quality: minutes_text(plan.minutes(PLANNED)) for quality, plan in plans.items()} if photos else {},
+        "minutes": {quality: minutes_text(plan.minutes(PLANNED)) for quality, plan in plans.items()},
         "has_view": resources.points is not None,
         "has_model": "files" in contents.stages,
     }
-    folder = project.view
-    (folder / "points").mkdir(parents=True, exist_ok=True)
-    for number, level in enumerate(resources.levels):
-        _write(folder / "points" / str(number), level)
+    files = {"result.json": json.dumps(result).encode("utf-8")}
     view = resources.view()
     if view is not None:
-        _write(folder / "three.js", three_script().encode("utf-8"))
-        _write(folder / "index.html", render_view(view, rows).encode("utf-8"))
+        files["index.html"] = render_view(view, rows).encode("utf-8")
+        files["three.js"] = three_script().encode("utf-8")
+        files |= {f"points/{number}": level for number, level in enumerate(resources.levels)}
         light = resources.find("/light.glb")
         if light is not None and isinstance(light.content, bytes):
-            _write(folder / "light.glb", light.content)
-    _write(folder / "result.json", json.dumps(result).encode("utf-8"))
-    return choose_plan(photos, run.settings, run.workers, run.memory_mb, PLANNED) if photos else None
+            files["light.glb"] = light.content
+    save_files(files, project.view)
+    return plans.get(run.settings.quality)
 
 
-def _write(path: Path, data: bytes) -> None:
-    with replace_atomically(path) as draft:
-        draft.write_bytes(data)
+def _photo(row: PhotoRow, number: int, project: Project) -> dict[str, Any]:
+    """Return the row of a photo with its name as in the project; where several inputs are read, it has the path."""
+    name = row.name.removeprefix(f"{project.source}/")
+    file = name.partition(": ")[0]  # ZIP: MEMBER
+    return {"name": name, "file": file, "number": number, "state": row.state, "reason": row.reason}
 
 
 def run_project(project: Project, last: str) -> None:
     """Run a project up to a stage."""
     settings = Settings.from_mapping(project.settings())
     try:
-        reconstruct(project.inputs(), project.out, settings, last=last, progress=Reporter(project, settings))
+        reconstruct(project.inputs(), project.out, settings, last=last, progress=Reporter(project))
     finally:
-        if (project.out / "manifest.json").exists():
-            _show(project, settings)
+        if (project.out / MANIFEST).exists():
+            _show(project)
 
 
 def export_project(project: Project, file_format: str) -> None:
@@ -145,7 +152,7 @@ def export_project(project: Project, file_format: str) -> None:
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
     if file_format in load_plugins().exporters:
-        files = list(export_model(project.out, file_format, target / f"{project.name}"))
+        files = list(export_model(project.out, file_format, target / project.name))
     else:
         made = export_scene(project.out, file_format, target / "scene")
         files = sorted(path for path in made.rglob("*") if path.is_file()) if made.is_dir() else [made]
@@ -160,15 +167,10 @@ def export_project(project: Project, file_format: str) -> None:
     say(file=archive.name)
 
 
-def _end_with_input() -> None:
-    sys.stdin.read()
-    interrupt_main_thread()
-
-
 def main(job: str, folder: str, *rest: str) -> int:
     """Do a job; the last line says how it ended."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    threading.Thread(target=_end_with_input, daemon=True).start()
+    watch_parent(os.getppid(), interrupt_main_thread)
     project = Project(Path(folder))
     try:
         with heed_requests_to_end():

@@ -95,6 +95,36 @@ def test_a_killed_studio_goes_on_and_a_paused_run_waits(jobs, project):
     assert "match_graph" in stages
 
 
+def test_a_run_that_is_stopped_before_its_process_starts_does_not_run(jobs, project):
+    jobs.start(project)
+
+    def stop():
+        if project.wanted != RUNNING:
+            return False
+        jobs.stop(project, PAUSED)
+        return True
+
+    work_until(jobs, stop)
+    work_until(Jobs(jobs.projects), lambda: True)
+    assert project.wanted == PAUSED and not (project.out / "manifest.json").exists()
+
+
+def test_photos_of_an_archive_have_their_states_and_pictures(jobs, project):
+    photos = sorted(project.source.iterdir())
+    with zipfile.ZipFile(project.source / "rest.zip", "w") as archive:
+        for photo in photos[3:]:
+            archive.write(photo, photo.name)
+            photo.unlink()
+    asyncio.run(jobs.check(project))
+    (project.source / "late.jpg").write_bytes(b"a photo")
+    rows = {row["name"]: (row["state"], row.get("number")) for row in project.rows()}
+    assert rows.pop("rest.zip")[0] == "read" and rows.pop("late.jpg")[0] == "new"
+    assert {state for state, _ in rows.values()} == {"usable"} and len(rows) == len(photos)
+    names = project.result()["names"]
+    for photo in photos[3:]:
+        assert names[rows[f"rest.zip: {photo.name}"][1]] == f"rest/{photo.name}"
+
+
 def bomb(archive):
     archive.writestr("a.jpg", bytes(10**6), zipfile.ZIP_DEFLATED)
 

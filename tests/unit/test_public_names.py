@@ -85,7 +85,9 @@ def test_a_display_is_taken_as_it_is_and_nothing_is_silence():
 
 def test_toml_round_trip(tmp_path):
     path = tmp_path / "run.toml"
-    changed = Settings.from_mapping({"seed": 7, "quality": "draft", "depth": {"neighbors": 9}})
+    changed = Settings.from_mapping(
+        {"seed": 7, "quality": "draft", "depth": {"neighbors": 9}, "photos": {"images": "Fotos 📷\x7f.txt"}}
+    )
     path.write_text(changed.to_toml(), encoding="utf-8")
     assert Settings.from_toml(path) == changed
     assert changed != Settings()

@@ -7,7 +7,7 @@
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     const length = `${document.getElementById("size-length").value.replace(",", ".")}${document.getElementById("size-unit").value}`;
-    const answer = await fetch("..", { method: "PATCH", body: JSON.stringify({ size: [...viewer.places(), length] }) });
+    const answer = await fetch(location.pathname.replace(/\/view\/$/, ""), { method: "PATCH", body: JSON.stringify({ size: [...viewer.places(), length] }) });
     const said = document.getElementById("measured-hint");
     said.textContent = answer.ok ? "The size is set; the model follows in a moment." : (await answer.json()).message;
     if (answer.ok) window.parent.postMessage("changed", window.location.origin);

@@ -24,6 +24,7 @@ function warn(text) {
 }
 
 async function ask(method, address, body) {
+  const before = alertBox.textContent;
   let answer;
   try {
     answer = await fetch(`/api/projects${address}`, { method, body: body instanceof Blob || body === undefined ? body : JSON.stringify(body) });
@@ -36,7 +37,8 @@ async function ask(method, address, body) {
     warn([found.message, found.hint && texts.toDo(found.hint)].filter(Boolean).join(". "));
     throw new Error(found.message);
   }
-  warn("");
+  // an error stays to be read until the next action, though the page asks all the time
+  if (alertBox.textContent === before && (method !== "GET" || before === texts.gone)) warn("");
   return found;
 }
 
@@ -107,6 +109,7 @@ async function upload(project, files) {
 
 async function showProjects() {
   const projects = await ask("GET", "");
+  if (location.hash.length > 1) return; // meanwhile, the user has gone to a project
   const fresh = async (files) => {
     if (!files.length) return;
     const folder = files[0].webkitRelativePath.split("/")[0];
@@ -133,7 +136,7 @@ async function showProjects() {
 }
 
 function card(project) {
-  const picture = project.picture && make("img", { alt: "", loading: "lazy", src: `/api/projects${path(project.name)}/view/pictures/0` });
+  const picture = project.has_picture && make("img", { alt: "", loading: "lazy", src: `/api/projects${path(project.name)}/view/pictures/0` });
   const state = texts.states[project.state] || project.headline;
   return make("li", {}, make("a", { href: `#${encodeURIComponent(project.name)}` }, picture || make("span", { className: "blank" }), make("b", {}, project.name), make("small", {}, state)));
 }
@@ -200,8 +203,8 @@ class ProjectPage {
     this.fillActions(wanted, state, count);
     const number = STAGES.indexOf(state.stage);
     const stage = number < 0 ? texts.starting : texts.stage(number + 1, STAGES.length, texts.stages[state.stage]);
-    const left = state.minutes_left === null ? "" : texts.left(state.minutes_left);
-    setText(parts.status, count ? texts.uploading(count.done, count.all) : working ? [stage, left].filter(Boolean).join(", ") : texts[wanted] ?? (state.has_model ? texts.finished : state.photos && !state.minutes && !state.failure ? texts.checking : ""));
+    const left = number < 1 ? "" : state.minutes_left === null ? texts.longer : texts.left(state.minutes_left);
+    setText(parts.status, count ? texts.uploading(count.done, count.all) : working ? [stage, state.total > 1 ? texts.of(state.done, state.total) : "", left].filter(Boolean).join(", ") : texts[wanted] ?? (state.has_model ? texts.finished : state.photos && !state.minutes && !state.failure ? texts.checking : ""));
     parts.bar.hidden = !count && !working;
     const part = count ? count.done / count.all : (Math.max(number, 0) + (state.total ? state.done / state.total : 0)) / STAGES.length;
     parts.bar.value = part;
@@ -289,9 +292,9 @@ class ProjectPage {
       const key = JSON.stringify([row, working]);
       return before.get(key) ?? make(
         "li", { className: row.reason ? "odd" : "", "data-key": key },
-        make("img", { loading: "lazy", alt: "", src: `/api/projects${this.at}/photos${path(row.name)}` }),
+        make("img", { loading: "lazy", alt: "", src: `/api/projects${this.at}/${row.name === row.file ? `photos${path(row.name)}` : `view/pictures/${row.number}`}` }),
         make("b", {}, row.name), make("small", {}, [texts.photoStates[row.state] ?? row.state, row.reason].filter(Boolean).join(": ")),
-        working ? null : make("button", { type: "button", "aria-label": texts.removeOf(row.name), title: texts.remove, onclick: () => this.remove(row.name) }, "×"),
+        working || row.name !== row.file ? null : make("button", { type: "button", "aria-label": texts.removeOf(row.name), title: texts.remove, onclick: (event) => this.remove(row.name, event.target.closest("li")) }, "×"),
       );
     };
     const wanted = rows.map(item), kept = new Set(wanted);
@@ -299,8 +302,9 @@ class ProjectPage {
     wanted.forEach((one, k) => { if (this.parts.photos.children[k] !== one) this.parts.photos.insertBefore(one, this.parts.photos.children[k] ?? null); });
   }
 
-  async remove(name) {
+  async remove(name, item) {
     await ask("DELETE", `${this.at}/photos`, { names: [name] });
+    item.remove();
     this.refresh();
   }
 

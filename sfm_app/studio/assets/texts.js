@@ -24,7 +24,7 @@ export const texts = {
   uploading: (done, all) => `uploading ${done} of ${all}`,
   checking: "looking at the photos",
   linked: (folder) => `The photos lie in ${folder} and stay there.`,
-  photoStates: { new: "new", usable: "usable", placed: "in the model", "not placed": "not in the model", "left out": "left out", elsewhere: "in another part" },
+  photoStates: { new: "new", read: "read", usable: "usable", placed: "in the model", "not placed": "not in the model", "left out": "left out", elsewhere: "in another part" },
   // making
   make: "Make the model",
   quality: "Quality",
@@ -44,6 +44,8 @@ export const texts = {
     texture: "colors", files: "writing the model",
   },
   left: (minutes) => (minutes < 1 ? "less than a minute left" : `about ${Math.round(minutes)} min left`),
+  of: (done, all) => `${done} of ${all}`,
+  longer: "this takes longer than planned",
   starting: "starting",
   finished: "Finished.",
   failed: "It did not work",

@@ -87,6 +87,22 @@ def test_removed_uploads_are_kept_aside(projects):
     assert (project.root / "project.json").is_file()
 
 
+def test_another_file_of_a_removed_name_is_kept_beside_it(projects):
+    project = projects.create("jug")
+    for content in (b"one", b"two"):
+        put(project, "a.jpg", content)
+        project.remove(["a.jpg"])
+    assert sorted(path.read_bytes() for path in (project.root / "removed").iterdir()) == [b"one", b"two"]
+
+
+def test_uploads_of_a_killed_server_are_forgotten(projects):
+    project = projects.create("jug")
+    put(project, "a.jpg")
+    (project.root / ".upload-1").write_bytes(b"half")
+    project.forget_uploads()
+    assert [path.name for path in project.root.rglob("*") if path.is_file()] == ["project.json", "a.jpg"]
+
+
 def test_a_folder_of_the_user_stays_as_it_is(projects, tmp_path):
     folder = tmp_path / "holiday photos"
     folder.mkdir()

@@ -92,6 +92,7 @@ def test_the_token_of_the_address_becomes_a_cookie(ask):
 def test_strangers_are_refused(ask, method, path, headers):
     answer, content = ask(method, path, {"name": "x"} if method == "POST" else None, **headers)
     assert answer.status == 403 and TOKEN.encode() not in content
+    assert "default-src 'none'" in answer.getheader("Content-Security-Policy")
     assert not list(ask.folder.iterdir())
 
 
@@ -168,12 +169,19 @@ def test_photos_are_listed_and_can_be_taken_out(ask, jug, photo):
     assert ask.json("GET", jug)["photos"] == 1
 
 
-def test_ten_thousand_files_are_listed_in_time(ask, jug):
+def test_ten_thousand_files_are_listed(ask, jug):
     folder = ask.folder / "jug" / "photos"
     folder.mkdir()
     for number in range(10_000):
         (folder / f"{number}.jpg").touch()
     assert len(ask.json("GET", f"{jug}/photos")) == 10_000
+
+
+def test_an_unknown_action_stops_nothing(ask, jug):
+    project = ask.json("GET", jug)
+    ask.json("POST", f"{jug}/pause")
+    answer, _ = ask("POST", f"{jug}/explode")
+    assert answer.status == 404 and ask.json("GET", jug)["state"] == "paused" != project["state"]
 
 
 def test_a_project_is_deleted_with_its_files(ask, jug, photo):
