@@ -5,6 +5,7 @@ A section is a pydantic model; flags, help and the TOML file come from its field
 
 import difflib
 import json
+import math
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -28,6 +29,8 @@ MarkerFamily = Literal[
 ConstraintForm = Literal["huang-faugeras", "frobenius", "trivedi", "polynomial"]
 AS_NEEDED, MOST_LEVELS = 0, 4
 """Numbers of sizes of depth maps: 0 for as many as the photos need, and the most. Chosen by hand."""
+MIN_DETOUR = 1.005
+"""Least detour by the third of three places of a surface: with less, they are on a line but for the clicks. By hand."""
 LOCAL_ADDRESS = re.compile(r"local:([1-9]\d{0,2})")
 """A cluster of so many processes of this machine."""
 SCHEDULER_ADDRESS = re.compile(r"(?:[a-z]+://)?(?:[\w.-]+|\[[\da-fA-F:.]+\]):\d{1,5}")
@@ -164,6 +167,9 @@ class ScaleSettings(Section):
     distances: tuple[tuple[str, str, str], ...] = Field(
         (), description='known distances, each ["x,y,z", "x,y,z", "1.25m"]; measure in the report prints points'
     )
+    level: tuple[tuple[str, str, str], ...] = Field(
+        (), description='places on level surfaces seen from above, each three "x,y,z"; they set the up direction'
+    )
     markers: str = Field("", description="side of the dark square of printed markers, such as 50mm; none where empty")
     marker_family: MarkerFamily = Field("auto", description="family of these markers; auto: the common ones")
     control_points: str = Field("", description="file of ground control points, as OpenDroneMap's gcp_list.txt")
@@ -185,6 +191,17 @@ class ScaleSettings(Section):
                 raise ValueError("a distance needs two different points")
             parse_length(length)
         return distances
+
+    @field_validator("level")
+    @classmethod
+    def check_level(cls, level: tuple[tuple[str, str, str], ...]) -> tuple[tuple[str, str, str], ...]:
+        """Return valid places; ValueError otherwise."""
+        for places in level:
+            a, b, c = map(parse_point, places)
+            sides = sorted(map(math.dist, (a, b, c), (b, c, a)))
+            if sides[0] + sides[1] <= MIN_DETOUR * sides[2]:
+                raise ValueError("three places of a level surface must not lie on a line")
+        return level
 
 
 class DepthSettings(Section):

@@ -77,6 +77,7 @@ SETTING_FLAGS = (
     SettingFlag("--camera-model", "scene.camera_model", metavar="MODEL"),
     SettingFlag("--mapper", "scene.mapper"),
     SettingFlag("--scale", "scale.distances", metavar="A B LENGTH", parts=3),
+    SettingFlag("--level", "scale.level", metavar="A B C", parts=3),
     SettingFlag("--markers", "scale.markers", metavar="LENGTH"),
     SettingFlag("--gcp", "scale.control_points", metavar="FILE"),
     SettingFlag("--faces", "mesh.faces"),

@@ -160,6 +160,8 @@ def scale_lines(counts: Mapping[str, Any]) -> Iterator[str]:
         yield f"size        in meters, +- {counts['deviation_percent']:.2g} %, by {list_names(names, 3)}"
     else:
         yield "size        unknown: measure it in the report, or use --markers or --gcp"
+    if counts.get("level"):
+        yield "            upright by the level surfaces that you have given"
     for text in (*counts["contradictions"], *counts["problems"]):
         yield f"            beware: {text}"
 
@@ -185,7 +187,8 @@ def result_lines(intrinsics: Intrinsics | None, scene: Scene | None, stages: Map
     for stage in ("view_graph", "intrinsics"):
         lines += [f"            {text}" for text in contradiction_lines(counts.get(stage, {}))]
     if scene is not None:
-        lines += scene_lines(scene, counts.get("scene", {}))
+        is_leveled = counts.get("scale", {}).get("level", 0)  # the user knows what is up
+        lines += scene_lines(scene, counts.get("scene", {}) | ({"orientation": {}} if is_leveled else {}))
     return [*lines, *scale_lines(counts["scale"])] if "scale" in counts else lines
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from sfm_app.colmap.model import sparse_model
 from sfm_app.frame import known_lengths
 from sfm_app.frame.control_points import ControlFit, find_mistake, fit_control_points
-from sfm_app.frame.scale import GPS, MetricFrame, ScaleEvidence, agree, move_model
+from sfm_app.frame.scale import GPS, MetricFrame, ScaleEvidence, agree, move_model, stand_upright
 from sfm_app.frame.sighted_points import PosedPhotos
 from sfm_app.products import write_frame
 from sfm_app.runtime.context import RunContext
@@ -41,6 +41,11 @@ def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
     shape = float(max((share for share in shares if np.isfinite(share)), default=0.0))
     frame = _agreed_frame(evidence, control, shape)
     frame = frame if control else replace(frame, place=scene.gps_place)
+    if options.level and frame.place is not None:
+        problems.append("the level surfaces are not used: the place on the map also gives the up direction")
+    elif options.level:
+        frame = stand_upright(frame, options.level, PosedPhotos(scene.model_dir).sightlines().centers)
+        run.record(level=len(options.level))
     run.record(
         unit="meter" if frame.is_metric else "arbitrary",
         scale=frame.from_model.scale,

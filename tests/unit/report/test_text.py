@@ -9,7 +9,7 @@ import pytest
 
 from sfm_app.camera.bearings import field_of_view_deg
 from sfm_app.camera.models import camera_matrix
-from sfm_app.report.text import camera_texts, field_text, held_text, lens_text, scene_lines, scene_summary
+from sfm_app.report.text import camera_texts, field_text, held_text, lens_text, result_lines, scene_lines, scene_summary
 from sfm_app.settings import HYPOTHESES, HypothesisName
 from sfm_app.types import Calibration, CameraModel, Scene
 
@@ -161,6 +161,15 @@ def test_a_model_that_may_stand_the_wrong_way_up_comes_with_a_remedy():
     lying = describe(orientation=unsure | {"up_sign_odds": 70.0, "up_axis_odds": 1.5, "photos_turned_deg": 0})[0]
     assert "upside down" not in lying and "lie on its side" in lying and "scene.photo_rotation_deg=90 or 270" in lying
     assert "beware" not in describe(orientation=unsure | {"up_sign_odds": 70.0})[0]
+
+
+def test_who_has_given_a_level_surface_reads_no_doubts_of_the_up_direction():
+    unsure = COUNTS | {"orientation": COUNTS["orientation"] | {"up_axis_odds": 1.5, "photos_turned_deg": 0}}
+    size = {"unit": "arbitrary", "contradictions": [], "problems": []}
+    texts = ["\n".join(result_lines(None, Scene(Path("sparse"), PLACED, {}, {}, 1234, 5000, 0.3), {
+        "scene": {"counts": unsure}, "scale": {"counts": size | level}})) for level in ({}, {"level": 1})]  # fmt: skip
+    assert "lie on its side" in texts[0] and "level surfaces" not in texts[0]
+    assert "lie on its side" not in texts[1] and "upright by the level surfaces" in texts[1]
 
 
 def test_a_failed_adjustment_is_named():
