@@ -24,6 +24,7 @@ from sfm_app.runtime.workspace import Workspace
 from sfm_app.selfcal.wide_lens import LensEstimate, find_lens
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Intrinsics, Rejected, Scene, SceneArrays
+from sfm_app.types.arrays import FloatArray
 
 if TYPE_CHECKING:
     from sfm_app.engine.stage import Products
@@ -284,7 +285,12 @@ def view_run(
 
 
 def export_model(
-    out: PathLike, file_format: str = "", target: PathLike | None = None, *, points: bool = False
+    out: PathLike,
+    file_format: str = "",
+    target: PathLike | None = None,
+    *,
+    points: bool = False,
+    box: ArrayLike | None = None,
 ) -> tuple[Path, ...]:
     """Write the model of a finished run in another format, or to another place; nothing is recomputed.
 
@@ -293,13 +299,15 @@ def export_model(
             for the suffix of `target`.
         target: file to write; None for OUT/model.FORMAT, OUT/points.FORMAT, OUT/model-draco.glb, ...
         points: export the points and cameras of the sparse reconstruction instead of the model.
+        box: (2, 3) opposite corners in the frame of exported files; only what is in between is written.
 
     Returns:
         The files, first the one to open, then its parts.
 
     Raises:
         ConfigError: the format is unknown, needs a missing package, or does not fit the suffix of `target`.
-        InputError: the run has no model yet, or the target cannot be written.
+        InputError: the run has no model yet, the box is empty, or the target cannot be written.
+        ValueError: a corner is not three finite numbers.
 
     Examples:
         >>> import sfm_app
@@ -307,7 +315,7 @@ def export_model(
         >>> [path.name for path in files[:2]]
         ['model.obj', 'model.mtl']
     """
-    from sfm_app.exports import check_parts, record_map, stored_model  # loads COLMAP
+    from sfm_app.exports import check_parts, crop, record_map, stored_model  # loads COLMAP
 
     plugins = load_plugins()
     place = Path(target) if target is not None else Path(out)
@@ -318,6 +326,7 @@ def export_model(
     place = _with_suffix(place, exporter.suffix)
     with open_run(Path(out), Settings(), None) as run:
         model = stored_model(run, points=points)
+        model = model if box is None else crop(model, _sorted_box(box))
     files = exporter.write(model, place.stem)
     renamed = dict(zip([place.name, *list(files)[1:]], files.values(), strict=True))
     with _naming_target(place):
@@ -328,7 +337,12 @@ def export_model(
 
 
 def export_scene(
-    out: PathLike, file_format: str, target: PathLike | None = None, *, progress: Progress | Callback | None = None
+    out: PathLike,
+    file_format: str,
+    target: PathLike | None = None,
+    *,
+    box: ArrayLike | None = None,
+    progress: Progress | Callback | None = None,
 ) -> Path:
     """Write cameras, poses, points and photos of a finished run for another program; no mesh is needed.
 
@@ -336,9 +350,11 @@ def export_scene(
         file_format: "colmap", "splat", "nerfstudio", "cameras", or another that `sfm-app plugins` lists.
         target: file or folder to write; None for OUT/cameras.json, OUT/cloud.laz, OUT/export/colmap, ... An export
             replaces the folder of an earlier one.
+        box: as of `export_model`, for formats of the dense cloud.
 
     Raises:
-        ConfigError: the format is unknown, needs a missing package, or does not fit the suffix of `target`.
+        ConfigError: the format is unknown, needs a missing package, does not fit the suffix of `target`, or takes no
+            box.
         InputError: the run lacks data for the format, its photos are gone, or the target cannot be written or holds
             files that no export has written.
 
@@ -351,9 +367,11 @@ def export_scene(
     from sfm_app.exports import StoredScene, check_cloud, fill_folder, record_map  # loads COLMAP
 
     exporter = load_plugins().scene_exporter(file_format)
+    if box is not None and exporter.needs != CLOUD:
+        raise ConfigError(f"a box does not apply to the format '{exporter.name}'", hint="omit it")
     place = Path(target) if target is not None else Path(out)
     with open_run(Path(out), Settings(), progress) as run:
-        scene = StoredScene(run)
+        scene = StoredScene(run, None if box is None else _sorted_box(box))
         if exporter.needs == CLOUD:
             check_cloud(run)
         if not exporter.file:
@@ -366,6 +384,14 @@ def export_scene(
             exporter.write(scene, path)
             record_map(run, file.parent)
         return file
+
+
+def _sorted_box(box: ArrayLike) -> FloatArray:
+    """Return the least and the greatest coordinates of a box by opposite corners."""
+    corners = np.array(box, np.float64)
+    if corners.shape != (2, 3) or not np.isfinite(corners).all():
+        raise ValueError("each corner is three finite numbers")
+    return np.sort(corners, axis=0)
 
 
 def _with_suffix(place: Path, suffix: str) -> Path:

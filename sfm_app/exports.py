@@ -35,17 +35,19 @@ from sfm_app.frame.coordinates import MapFrame
 from sfm_app.frame.scale import GPS, MetricFrame, map_entry, move_model
 from sfm_app.frame.sighted_points import Distance, PosedPhotos, measure_distance
 from sfm_app.geometry.poses import Similarity
+from sfm_app.geometry.triangles import select_faces
 from sfm_app.numerical import json_text
 from sfm_app.operating_system import is_link
 from sfm_app.photos.masks import mask_path, save_mask
 from sfm_app.pipeline import MESH, SCALE, SCENE, TEXTURE
 from sfm_app.products import read_photo_list
 from sfm_app.runtime.context import RunContext
-from sfm_app.types import Model, Scene, SceneArrays
-from sfm_app.types.arrays import FloatArray
+from sfm_app.types import Model, Scene, SceneArrays, Surface, Texture
+from sfm_app.types.arrays import BoolArray, FloatArray
 from sfm_app.types.scene import PerspectivePhoto, PointCloud
 from sfm_app.wording import list_names
 
+EMPTY_BOX, BOX_HINT = "nothing of the model is in the box", "its corners are in the frame of OUT/model.glb"
 COLORS, NORMALS = ("red", "green", "blue"), ("nx", "ny", "nz")
 """Fields of the dense cloud."""
 
@@ -94,6 +96,34 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
     check_finished(run, [SCENE], "points")
     with check_undamaged(SCENE, run):
         return move_model(sparse_model(run.workspace.sparse), stored_frame(run).from_model)
+
+
+def crop(model: Model, box: FloatArray) -> Model:
+    """Return what lies in a box, (2, 3) with the least and the greatest coordinates; InputError where nothing does.
+
+    Triangles across its sides go.
+    """
+    surface, texture = model.surface, model.texture
+    inside = in_box(surface.vertices, box)
+    if not len(surface.faces):
+        return replace(model, surface=Surface(surface.vertices[inside], surface.faces, surface.colors[inside]))
+    keep = np.asarray(inside[surface.faces].all(axis=1))
+    if not keep.any():
+        raise InputError(EMPTY_BOX, hint=BOX_HINT)
+    if texture is not None:
+        used, page = np.unique(texture.page[keep], return_inverse=True)
+        pages = tuple(texture.pages[number] for number in used)
+        maps = tuple(texture.normal_maps[number] for number in used if texture.normal_maps)
+        texture = Texture(texture.uv[keep], page.astype(np.int32), pages, maps)
+    return replace(model, surface=select_faces(surface, keep), texture=texture)
+
+
+def in_box(points: FloatArray, box: FloatArray) -> BoolArray:
+    """Return which points (N, 3) lie in a box, as above; InputError if none does."""
+    inside = np.asarray(((points >= box[0]) & (points <= box[1])).all(axis=1))
+    if not inside.any():
+        raise InputError(EMPTY_BOX, hint=BOX_HINT)
+    return inside
 
 
 def stored_scene(run: RunContext) -> tuple[Scene, Reconstruction]:
@@ -158,8 +188,8 @@ IMAGES, MASKS = "images", "masks"
 class StoredScene:
     """The scene of a finished run, a `FinishedScene`."""
 
-    def __init__(self, run: RunContext) -> None:
-        self._run = run
+    def __init__(self, run: RunContext, box: FloatArray | None = None) -> None:
+        self._run, self._box = run, box
         self.scene, self._model = stored_scene(run)
         self._place = stored_frame(run).place
         self.images = dict[str, str]()
@@ -170,8 +200,13 @@ class StoredScene:
         return all_points(self._model)
 
     def cloud(self) -> PointCloud:
-        """Return the dense cloud."""
-        return stored_cloud(self._run)
+        """Return the dense cloud, or what is in the box."""
+        cloud = stored_cloud(self._run)
+        if self._box is None:
+            return cloud
+        inside = in_box(cloud.points, self._box)
+        normals = None if cloud.normals is None else cloud.normals[inside]
+        return PointCloud(cloud.points[inside], cloud.colors[inside], normals)
 
     def cloud_on_map(self) -> tuple[PointCloud, str]:
         """Return the dense cloud, z up in a system, and its WKT; as in `cloud` and empty where the place is unknown."""

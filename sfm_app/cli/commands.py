@@ -266,20 +266,35 @@ class ExportCommand(click.Command):
     help="File or folder to write.  [default: OUT/model.FORMAT, OUT/cameras.json, OUT/export/FORMAT, ...]",
 )
 @click.option("--points", is_flag=True, help="Export the sparse points and the cameras instead of the model.")
+@click.option(
+    "--box", nargs=2, metavar="A B", help="Export what is between these corners, x,y,z in the frame of OUT/model.glb."
+)
 @output_options
-def export(out: Path, file_format: str, target: Path | None, points: bool, quiet: bool, as_json: bool) -> None:
+def export(
+    out: Path,
+    file_format: str,
+    target: Path | None,
+    points: bool,
+    box: tuple[str, str] | None,
+    quiet: bool,
+    as_json: bool,
+) -> None:
     """Write the results of the run in OUT for another program, without recomputing anything."""
     from sfm_app.cli.terminal import Terminal
     from sfm_app.plugins import load_plugins
 
     name = choose_format(file_format, target)
+    try:
+        corners = None if box is None else [parse_point(corner) for corner in box]
+    except ValueError as err:
+        raise ConfigError(str(err), hint="--box -1,0,-0.5 1,2,0.5") from None
     if name in load_plugins().scene_exporters:
         if points:
             raise ConfigError(f"--points does not apply to the format '{name}'", hint="omit it")
         with Terminal(quiet=quiet or as_json) as progress:
-            paths = [sfm_app.export_scene(out, name, target, progress=progress)]
+            paths = [sfm_app.export_scene(out, name, target, box=corners, progress=progress)]
     else:
-        paths = list(sfm_app.export_model(out, name, target, points=points))
+        paths = list(sfm_app.export_model(out, name, target, points=points, box=corners))
     print_json([str(path) for path in paths]) if as_json else print_lines(file_lines(paths))
 
 

@@ -290,3 +290,56 @@ def test_a_target_that_cannot_be_written_is_named(finished, tmp_path):
     result = call(finished, "-o", tmp_path / "file" / "model.glb")
     assert (result.exit_code, "cannot write" in result.stderr) == (3, True)
     assert str(tmp_path / "file") in result.stderr
+
+
+def test_a_box_cuts_the_model_and_its_pages_without_changing_what_stays(textured_ball, finished, tmp_path):
+    corners = textured_ball.surface.vertices[textured_ball.surface.faces]
+    low, high = np.array([-9.0, 0.2, -9.0]), np.array([0.5, 9.0, 9.0])
+    inside = ((corners >= low) & (corners <= high)).all(axis=(1, 2))
+    result = call(finished, "-o", tmp_path / "part.obj", "--box", "0.5,0.2,9", "-9,9,-9")  # corners in any order
+    part = trimesh.load(tmp_path / "part.obj", force="mesh", process=False)
+    assert result.exit_code == 0 and 0 < inside.sum() < len(corners)
+    places = lambda triangles: sorted(map(tuple, triangles.mean(axis=1).round(4)))  # noqa: E731
+    assert places(part.triangles) == places(corners[inside])
+    pages = set(textured_ball.texture.page[inside])
+    assert len(list(tmp_path.glob("part*.jpg"))) == len(pages)
+
+
+def test_only_the_pages_of_a_part_are_written(textured_ball):
+    first = textured_ball.texture.page == textured_ball.texture.page.max()
+    lone = textured_ball.surface.vertices[textured_ball.surface.faces[np.flatnonzero(first)[0]]]
+    part = exports.crop(textured_ball, np.array([lone.min(axis=0), lone.max(axis=0)]))
+    assert len(part.surface.faces) == 1 and np.allclose(part.surface.vertices[part.surface.faces[0]], lone)
+    assert part.texture.page.tolist() == [0] and part.texture.pages[0] is textured_ball.texture.pages[-1]
+    assert np.array_equal(part.texture.uv[0], textured_ball.texture.uv[first][0])
+
+
+@pytest.mark.parametrize("name", ["cloud-ply", "laz"])
+def test_a_box_cuts_the_dense_cloud(make_run, tmp_path, name):
+    run = make_run()
+    box = [(-1.0, -1.0, -1.0), (2.0, 2.0, 2.0)]
+    points = np.stack([run.cloud[axis] for axis in "xyz"], axis=1)
+    inside = ((points >= -1.0) & (points <= 2.0)).all(axis=1)
+    file = sfm_app.export_scene(run.out, name, tmp_path / f"part.{SCENE_EXPORTERS[name].suffix}", box=box)
+    if name == "laz":
+        import laspy
+
+        found = laspy.read(file).xyz
+        assert len(found) == inside.sum() > 5
+    else:
+        found = trimesh.load(file).vertices
+        assert np.allclose(np.sort(found, axis=0), np.sort(points[inside], axis=0), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (("--format", "obj", "--box", "5,5,5", "6,6,6"), 3, "nothing of the model is in the box"),
+        (("--format", "obj", "--box", "5,5", "6,6,6"), 2, "'5,5' is no point"),
+        (("--format", "colmap", "--box", "0,0,0", "1,1,1"), 2, "a box does not apply to the format 'colmap'"),
+    ],
+)
+def test_boxes_that_are_of_no_use_are_refused(finished, arguments, code, says):
+    result = call(finished, *arguments)
+    assert (result.exit_code, says in result.stderr) == (code, True), result.stderr
+    assert not list(finished.glob("model.*"))
