@@ -168,7 +168,7 @@ class ScaleSettings(Section):
         (), description='known distances, each ["x,y,z", "x,y,z", "1.25m"]; measure in the report prints points'
     )
     level: tuple[tuple[str, str, str], ...] = Field(
-        (), description='places on level surfaces seen from above, each three "x,y,z"; they set the up direction'
+        (), description='level surfaces, each three "x,y,z" counter-clockwise from above; the report prints them'
     )
     markers: str = Field("", description="side of the dark square of printed markers, such as 50mm; none where empty")
     marker_family: MarkerFamily = Field("auto", description="family of these markers; auto: the common ones")

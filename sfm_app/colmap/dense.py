@@ -187,6 +187,13 @@ class DenseStore:
         _write_depth_format(self.dense_dir, DEPTHS, view, maps.depth, kind)
 
 
+def names_of_estimates(dense_dir: Path) -> list[str]:
+    """Return the names of the views that have a photometric map of full size, the oldest first."""
+    folder, ending = dense_dir / "stereo" / DEPTHS, ".photometric.bin"
+    files = sorted((path.stat().st_mtime_ns, path) for path in folder.rglob(f"*{ending}"))
+    return [path.relative_to(folder).as_posix().removesuffix(ending) for _, path in files]
+
+
 def read_depth(dense_dir: Path, view: View, kind: Kind) -> Float32Array:
     """Read a depth map (H, W): 0 where unknown, MASKED where the photo is masked, SKY where it shows the sky."""
     return _read_depth_format(_map_path(dense_dir, DEPTHS, view, kind), view.name)
@@ -265,8 +272,8 @@ def _atomic_path(target: Path) -> Iterator[Path]:
     replace_file(beside, target)
 
 
-def read_photo_and_depth(dense_dir: Path, name: str) -> tuple[ByteArray, Float32Array]:
-    """Return the undistorted photo (H, W, 3) RGB and its confirmed depths (H, W), <= 0 where there is none.
+def read_photo_and_depth(dense_dir: Path, name: str, kind: Kind = "geometric") -> tuple[ByteArray, Float32Array]:
+    """Return the undistorted photo (H, W, 3) RGB and its depths (H, W), <= 0 where there is none.
 
     Raises:
         ValueError: the name leads out of the workspace, or the file is no photo.
@@ -278,4 +285,4 @@ def read_photo_and_depth(dense_dir: Path, name: str) -> tuple[ByteArray, Float32
     image = _decode(dense_dir, name, cv2.IMREAD_COLOR_RGB)
     if image is None:
         raise ValueError(f"{name} is no photo")
-    return image, _read_depth_format(dense_dir / "stereo" / DEPTHS / f"{name}.geometric.bin", name)
+    return image, _read_depth_format(dense_dir / "stereo" / DEPTHS / f"{name}.{kind}.bin", name)

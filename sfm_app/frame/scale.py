@@ -9,7 +9,6 @@ import numpy as np
 from sfm_app.frame.coordinates import MapFrame
 from sfm_app.geometry.poses import Similarity, normalize
 from sfm_app.types import MapPlace, Model, PosedPhoto
-from sfm_app.types.arrays import FloatArray
 from sfm_app.wording import parse_point
 
 GPS = "GPS of the photos"
@@ -119,20 +118,16 @@ def agree(evidence: Sequence[ScaleEvidence], shape: float = 0.0) -> MetricFrame:
     return MetricFrame(similarity, deviation, source, tuple(evidence), tuple(contradictions))
 
 
-def stand_upright(frame: MetricFrame, level: Sequence[tuple[str, str, str]], centers: FloatArray) -> MetricFrame:
+def stand_upright(frame: MetricFrame, level: Sequence[tuple[str, str, str]]) -> MetricFrame:
     """Return the frame with the normal of level surfaces up, on average, after the smallest turn.
 
-    Three places in the frame of OUT/sparse give a surface, as in the settings. Most cameras, at `centers` (N, 3), are
-    above it: they see the places.
+    Three places in the frame of OUT/sparse give a surface, counter-clockwise seen from above, as in the settings.
     """
     from scipy.spatial.transform import Rotation  # slow to import
 
-    normals = np.zeros(3)
-    for places in level:
-        a, b, c = (np.array(parse_point(place)) for place in places)
-        normal = normalize(np.cross(b - a, c - a))
-        normals += normal * (1.0 if np.median((centers - a) @ normal) > 0.0 else -1.0)
-    turn = Rotation.align_vectors([[0.0, 1.0, 0.0]], [normals])[0].as_matrix()
+    corners = np.array([[parse_point(place) for place in places] for places in level])
+    normals = normalize(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    turn = Rotation.align_vectors([[0.0, 1.0, 0.0]], [normals.sum(axis=0)])[0].as_matrix()
     return replace(frame, from_model=Similarity(frame.from_model.scale, turn, np.zeros(3)))
 
 

@@ -54,12 +54,13 @@ def list_masks(masks: str, photos: Path, out: Path) -> list[str]:
 def assign_masks(photos: Sequence[Photo], names: Collection[str], *, for_all: bool = False) -> list[Photo]:
     """Return the photos with their masks, empty without; one of `for_all`, or alone in its folder, masks all."""
     visible = {name for name in names if not PurePosixPath(name).name.startswith(".")}
-    assigned = [replace(photo, mask=_find_mask(photo.path, visible)) for photo in photos]
+    assigned = [replace(photo, mask=find_mask(photo.path, visible)) for photo in photos]
     is_alone = len(visible) == 1 and "/" not in "".join(visible) and not any(photo.mask for photo in assigned)
     return [replace(photo, mask=min(visible)) for photo in photos] if for_all or is_alone else assigned
 
 
-def _find_mask(path: str, names: Collection[str]) -> str:
+def find_mask(path: str, names: Collection[str]) -> str:
+    """Return the name of the mask of a photo; empty if there is none."""
     place = PurePosixPath(path)
     bases = [spelling.format(base) for spelling in SPELLINGS for base in (place.name, place.stem)]
     spelled = (str(place.with_name(base + suffix)) for suffix in SUFFIXES for base in bases)

@@ -138,20 +138,15 @@ def render_page(contents: RunContents, parts: LargeParts, other: RunContents | N
         depth_count=len(contents.counts("depth_maps").get("coverage", ())),
         view=parts.view is not None and bool(three_script()),
         served=parts.is_served,
-        data=_page_data(parts.view, rows),
+        data=page_data(parts.view, rows),
         studio=False,
         three=Markup(three_script()),  # noqa: S704 - a script of an installed package, without user text
     )  # fmt: skip
     return page.encode("utf-8", "replace").decode("utf-8")  # names of files need not be text
 
 
-def render_view(view: Mapping[str, Json], rows: Sequence[PhotoRow]) -> str:
-    """Return the page of the 3D view alone, for the studio: its server has the scripts, points and models."""
-    page = _environment().get_template("studio_view.html.jinja").render(data=_page_data(view, rows), studio=True)
-    return page.encode("utf-8", "replace").decode("utf-8")
-
-
-def _page_data(view: Mapping[str, Json] | None, rows: Sequence[PhotoRow]) -> Markup:
+def page_data(view: Mapping[str, Json] | None, rows: Sequence[PhotoRow]) -> Markup:
+    """Return what the scripts of the page read: the 3D view and the rows of the photos."""
     photos = [{k: v for k, v in asdict(row).items() if k != "picture" and v is not None} for row in rows]
     return script_data({"view": view, "photos": photos})
 

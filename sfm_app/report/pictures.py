@@ -4,7 +4,7 @@ import io
 import logging
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ from sfm_app.colmap.dense import read_photo_and_depth
 from sfm_app.colmap.model import ModelFigures
 from sfm_app.report.contents import UNREADABLE, RunContents, data_address
 from sfm_app.report.figures import OPTIONS, draw_intrinsics
+from sfm_app.stereo import Kind
 from sfm_app.types.arrays import ByteArray, FloatArray
 from sfm_app.types.scene import camera_center
 
@@ -213,10 +214,15 @@ class DepthPicture:
 
     name: str
     text: str
-    address: str
-    """JPEG as a data address: the photo at the left, depths at the right."""
+    jpeg: bytes
+    """The photo at the left, depths at the right."""
     size: tuple[int, int]
     """Width and height in pixels, so that the layout is stable while it loads."""
+
+    @property
+    def address(self) -> str:
+        """The picture as a data address."""
+        return data_address("image/jpeg", self.jpeg)
 
 
 def depth_pictures(contents: RunContents) -> list[DepthPicture]:
@@ -224,8 +230,12 @@ def depth_pictures(contents: RunContents) -> list[DepthPicture]:
     coverage: Mapping[str, float] = contents.counts("depth_maps").get("coverage", {})
     dense = contents.run.workspace.dense
     chosen = spread_names(sorted(coverage), MOST_SHOWN)
-    drawn = contents.run.map(lambda name: _draw(dense, name, coverage[name]), chosen, "depth maps of the report")
-    return [picture for picture in drawn if picture is not None]
+    drawn = contents.run.map(lambda name: draw_depths(dense, name), chosen, "depth maps of the report")
+    return [
+        replace(picture, text=f"{100 * coverage[picture.name]:.0f} % of it has a depth, {picture.text}")
+        for picture in drawn
+        if picture is not None
+    ]
 
 
 def spread_names(names: Sequence[str], most: int) -> list[str]:
@@ -236,9 +246,10 @@ def spread_names(names: Sequence[str], most: int) -> list[str]:
     return [names[round(float(place))] for place in places]
 
 
-def _draw(dense: Path, name: str, share: float) -> DepthPicture | None:
+def draw_depths(dense: Path, name: str, kind: Kind = "geometric") -> DepthPicture | None:
+    """Return a photo beside its depth map; None, with a line in the log, where one of them cannot be read."""
     try:
-        photo, depth = read_photo_and_depth(dense, name)
+        photo, depth = read_photo_and_depth(dense, name, kind)
         scale = min(1.0, SIDE_PX / max(depth.shape))
         size = max(1, round(depth.shape[1] * scale)), max(1, round(depth.shape[0] * scale))
         small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
@@ -248,8 +259,7 @@ def _draw(dense: Path, name: str, share: float) -> DepthPicture | None:
     except (*UNREADABLE, cv2.error) as err:  # the page has the others
         logger.info("no picture of the depths of %s", name, exc_info=err)
         return None
-    text = f"{100 * share:.0f} % of it has a depth, from {near:.3g} (yellow) to {far:.3g} (violet)"
-    return DepthPicture(name, text, data_address("image/jpeg", data.tobytes()), (2 * size[0], size[1]))
+    return DepthPicture(name, f"from {near:.3g} (yellow) to {far:.3g} (violet)", data.tobytes(), (2 * size[0], size[1]))
 
 
 def depth_colors(depth: FloatArray) -> tuple[ByteArray, tuple[float, float]]:

@@ -343,12 +343,7 @@ def _orientation_lines(orientation: Mapping[str, Any]) -> Iterator[str]:
     yield f"upright by {orientation['up']}, {accuracy}{meters}"
     if "swapped" in orientation.get("gps", ""):
         yield f"beware: GPS is {orientation['gps']}"
-    mistakes = {"up_sign_odds": ("stand upside down", (180,)), "up_axis_odds": ("lie on its side", (90, 270))}
-    for key, (what, turns) in mistakes.items():
+    for key, what in {"up_sign_odds": "stand upside down", "up_axis_odds": "lie on its side"}.items():
         odds = orientation.get(key, UNSURE_ODDS)
         if odds < UNSURE_ODDS:
-            others = " or ".join(str((orientation["photos_turned_deg"] + turn) % 360) for turn in turns)
-            yield (
-                f"beware: the model may {what} (odds {odds:.1f} to 1 against); if so, "
-                f"run again with --set scene.photo_rotation_deg={others}"
-            )
+            yield f"beware: the model may {what} (odds {odds:.1f} to 1 against); if so, press upright in the 3D view"

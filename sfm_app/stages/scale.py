@@ -44,7 +44,7 @@ def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
     if options.level and frame.place is not None:
         problems.append("the level surfaces are not used: the place on the map also gives the up direction")
     elif options.level:
-        frame = stand_upright(frame, options.level, PosedPhotos(scene.model_dir).sightlines().centers)
+        frame = stand_upright(frame, options.level)
         run.record(level=len(options.level))
     run.record(
         unit="meter" if frame.is_metric else "arbitrary",

@@ -31,6 +31,8 @@ class Progress:
     """Minutes left; None where they are not known."""
     views: int = 0
     """Counts the views that the worker has written."""
+    depths: int = 0
+    """Counts the pictures of depth maps."""
     messages: deque[str] = field(default_factory=lambda: deque(maxlen=MOST_MESSAGES))
     failure: str = ""
     hint: str = ""
@@ -43,7 +45,7 @@ class Progress:
             self.failure, self.hint = str(line["message"]), str(line["hint"])
         if "message" in line and "stage" in line:
             self.messages.append(str(line["message"]))
-        for name in ("stage", "done", "total", "minutes"):
+        for name in ("stage", "done", "total", "minutes", "depths"):
             if name in line:
                 setattr(self, name, line[name])
 
@@ -56,6 +58,8 @@ class Jobs:
         self.changed = asyncio.Event()
         self.locks = defaultdict[str, asyncio.Lock](asyncio.Lock)
         """By project: only one process works in it."""
+        self.unchecked = set[str]()
+        """Projects whose check waits for the process that works in them."""
         self.run: asyncio.Task[None] | None = None
         self.running = ""
         """Name of the project whose run is at work."""
@@ -106,19 +110,22 @@ class Jobs:
             project.note(wanted=IDLE)
 
     async def check(self, project: Project) -> None:
-        """Find out which photos are usable, and what a run would cost."""
-        await self._follow("check", project)
+        """Find out which photos are usable, and what a run would cost; one check serves all that waits for it."""
+        if project.name not in self.unchecked:
+            self.unchecked.add(project.name)
+            await self._follow("check", project)
 
     async def _follow(self, job: str, project: Project) -> None:
         async with self.locks[project.name]:
+            self.unchecked.discard(project.name)
             shown = self.progress[project.name] = Progress()
             await _work(shown.follow, job, project)
 
-    async def export(self, project: Project, file_format: str) -> dict[str, Any]:
-        """Write the model in another format; return the file, or the failure."""
+    async def export(self, project: Project, file_format: str, box: Any) -> dict[str, Any]:
+        """Write the model, or what is in a box of it, in another format; return the file, or the failure."""
         said = dict[str, Any]()
         async with self.locks[project.name]:
-            await _work(said.update, "export", project, file_format)
+            await _work(said.update, "export", project, file_format, json.dumps(box))
         return said
 
 

@@ -2,7 +2,7 @@
 
 A project has `project.json` (where its photos are, what is wanted), `settings.toml` (settings that differ from the
 defaults), `photos/` (what was uploaded), `removed/` (what the user took out), `model/` (output folder of the run),
-`exports/`, and `view/` (what the page shows; `worker` writes it).
+`masks/`, `exports/`, and `view/` (what the page shows; `worker` writes it).
 """
 
 import filecmp
@@ -20,10 +20,15 @@ from typing import Any
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.files import read_object, replace_atomically
 from sfm_app.photos.files import EXTENSIONS, list_photos
+from sfm_app.photos.masks import MASK_HINT, find_mask
 from sfm_app.settings import Settings, toml_value
 
 RECORD, SETTINGS, LIST, DRAFT = "project.json", "settings.toml", "photos.txt", ".upload-"
-PHOTOS, REMOVED, MODEL, VIEW, EXPORTS = "photos", "removed", "model", "view", "exports"
+PHOTOS, REMOVED, MODEL, VIEW, EXPORTS, MASKS = "photos", "removed", "model", "view", "exports", "masks"
+VIEW_DATA = "view.json"
+"""File in VIEW: what the scripts of the 3D view read, as part of a page."""
+DEPTHS = "depths"
+"""Folder in VIEW: pictures of the depth maps that are there, by number."""
 IDLE, QUEUED, RUNNING, PAUSED = "idle", "queued", "running", "paused"
 """What is wanted of a project: nothing, a run, the run that is at work, or a run that waits for the user."""
 APART = (*EXTENSIONS, ".zip")
@@ -64,7 +69,7 @@ class Project:
 
     def __init__(self, root: Path) -> None:
         self.root, self.name = root, root.name
-        self.out, self.view, self.exports = root / MODEL, root / VIEW, root / EXPORTS
+        self.out, self.view, self.exports, self.masks = root / MODEL, root / VIEW, root / EXPORTS, root / MASKS
 
     @property
     def record(self) -> dict[str, Any]:
@@ -80,6 +85,11 @@ class Project:
     def wanted(self) -> str:
         """What is wanted of it."""
         return str(self.record.get("wanted", IDLE))
+
+    @property
+    def title(self) -> str:
+        """What the user calls it."""
+        return str(self.record.get("title") or self.name)
 
     # photos
 
@@ -119,6 +129,11 @@ class Project:
         """Take photos out of the project: uploads move to `removed/`, files of the user stay where they are."""
         known = self.photos()
         chosen = [name for name in names if name in known]
+        masks = [self.masks / f"{name}.png" for name in chosen]
+        if any(mask.is_file() for mask in masks):
+            for mask in masks:
+                mask.unlink(missing_ok=True)
+            self.note_masks()
         if self.is_linked:
             self.note(removed=sorted({*self.record.get("removed", ()), *chosen}))
             kept = [name for name, why in self.photos().items() if not why]
@@ -127,6 +142,19 @@ class Project:
             return
         for name in chosen:
             move_beside(self.source / name, self.root / REMOVED / Path(name).name)
+
+    def mask(self, name: str) -> Path:
+        """Return the place of a mask, by the name of its photo or its own; InputError where it belongs to no photo."""
+        photos = self.photos()
+        photo = name if name in photos else next((one for one in photos if find_mask(one, {name})), "")
+        if not photo:
+            raise InputError(f"{name} is the mask of no photo here", hint=MASK_HINT)
+        return self.masks / f"{photo}.png"
+
+    def note_masks(self) -> None:
+        """Have a run use the masks, if there are any."""
+        has_masks = any(path.is_file() for path in self.masks.rglob("*"))
+        self.change("photos", "masks", str(self.masks) if has_masks else "")
 
     def forget_uploads(self) -> None:
         """Remove the files of uploads that a killed server has left."""
@@ -161,12 +189,17 @@ class Project:
     def rows(self) -> list[dict[str, Any]]:
         """Return its photos: name, file, state, reason, and number in the model; a file may hold several."""
         listed, known = self.photos(), self.result().get("photos", ())
+        masked = {path.relative_to(self.masks).as_posix() for path in self.masks.rglob("*.png")}
         rows = [row for row in known if row["file"] in listed]
         whole, held = {row["name"] for row in rows}, {row["file"] for row in rows}
         for name, why in listed.items():
             if name not in whole:
                 state = "left out" if why else "read" if name in held else "new"
                 rows.append({"name": name, "file": name, "state": state, "reason": why})
+        for row in rows:
+            is_photo = row["name"] == row["file"] and Path(row["name"]).suffix.lower() not in APART
+            row["can_mask"] = is_photo and row["state"] != "left out"
+            row["masked"] = f"{row['name']}.png" in masked
         return rows
 
     def result(self) -> dict[str, Any]:

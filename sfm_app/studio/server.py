@@ -18,37 +18,60 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import jinja2
 import uvicorn
+from markupsafe import Markup
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from sfm_app.errors import SfmError
+from sfm_app.errors import ConfigError, SfmError
 from sfm_app.operating_system import Ability, lacks
 from sfm_app.photos.decode import small_jpeg
 from sfm_app.report.listening import HEADERS, LOOPBACK, explain_ports, page_address
 from sfm_app.studio.jobs import Jobs, Progress
-from sfm_app.studio.projects import DRAFT, IDLE, MODEL, PAUSED, QUEUED, RUNNING, VIEW, Project, Projects
+from sfm_app.studio.projects import (
+    DEPTHS,
+    DRAFT,
+    IDLE,
+    LONGEST_NAME,
+    MODEL,
+    PAUSED,
+    QUEUED,
+    RUNNING,
+    VIEW,
+    VIEW_DATA,
+    Project,
+    Projects,
+)
 
 ASSETS = Path(__file__).parent / "assets"
 SHARED = Path(__file__).parents[1] / "report" / "assets"
 """Styles and scripts of the report, which the studio uses, too."""
+TEMPLATES = jinja2.Environment(
+    loader=jinja2.FileSystemLoader(SHARED), autoescape=True, undefined=jinja2.StrictUndefined
+)
 LOCAL_NAMES = (LOOPBACK, "localhost")
 FREE_BYTES = 2 * 2**30
 """Disk that uploads leave free: a run needs some. Chosen by hand."""
 SMALL_PX, LARGE_PX = 320, 2400
 """Longer sides of pictures in the list, and of those in the 3D view. Chosen by hand."""
+NO_PICTURE = (
+    b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 64 48"><path d="M20 12h24v24H20zM28 18v12l9-6z" fill="none" '
+    b'stroke="#78716c" stroke-linejoin="round"/></svg>'
+)
+"""A picture of what the browser cannot show, such as a video."""
 RESULTS = ("headline", "problem", "warnings", "facts", "minutes", "has_view", "has_model")
 STOPPED = {"pause": PAUSED, "cancel": IDLE}
 FORMATS = ("glb", "obj", "stl", "usdz", "ply", "laz", "splat", "blender")
 VIEW_FILES = {
-    "": f"{VIEW}/index.html", "three.js": f"{VIEW}/three.js", "light.glb": f"{VIEW}/light.glb",
+    "three.js": f"{VIEW}/three.js", "light.glb": f"{VIEW}/light.glb",
     "model.glb": f"{MODEL}/model.glb",
 }  # fmt: skip
 POLICY = (
@@ -101,6 +124,7 @@ class Studio:
         self.projects = Projects(folder)
         self.jobs = Jobs(self.projects)
         self.background = set[asyncio.Task[None]]()
+        self.pictures = asyncio.Semaphore(1)
 
     def project(self, request: Request) -> Project:
         """Return the project that a request names; 404 without one."""
@@ -113,26 +137,27 @@ class Studio:
 
     async def list(self, _: Request) -> Response:
         """Return all projects."""
-        return JSONResponse([self._summary(project) for project in self.projects])
+        return JSONResponse(await run_in_threadpool(lambda: [self._summary(project) for project in self.projects]))
 
     def _summary(self, project: Project) -> dict[str, Any]:
         result = project.result()
         return {
-            "name": project.name, "state": project.wanted, "headline": result.get("headline", ""),
-            "has_picture": bool(result.get("names")),
+            "name": project.name, "title": project.title, "state": project.wanted,
+            "headline": result.get("headline", ""), "has_picture": bool(result.get("names")),
         }  # fmt: skip
 
     async def show(self, request: Request) -> Response:
         """Return a project: its state, progress, results and settings."""
         project = self.project(request)
         shown, result, settings = self.jobs.progress.get(project.name, Progress()), project.result(), project.settings()
-        photos = project.photos()
+        photos = await run_in_threadpool(project.photos)
         return JSONResponse({
-            "name": project.name, "state": project.wanted, "source": str(project.source) if project.is_linked else "",
+            "title": project.title, "state": project.wanted, "source": str(project.source) if project.is_linked else "",
             "folder": str(project.root), "quality": settings.get("quality", "normal"),
             "command": project.command(photos),
             "markers": settings.get("scale", {}).get("markers", ""),
             "sizes": settings.get("scale", {}).get("distances", []),
+            "level": settings.get("scale", {}).get("level", []), "depths": shown.depths,
             "stage": shown.stage, "done": shown.done, "total": shown.total,
             "minutes_left": shown.minutes, "views": shown.views, "messages": [*shown.messages],
             "failure": shown.failure, "hint": shown.hint, "photos": len(photos),
@@ -141,14 +166,21 @@ class Studio:
 
     async def photos(self, request: Request) -> Response:
         """Return the photos of a project, each with its state and reason."""
-        return JSONResponse(self.project(request).rows())
+        return JSONResponse(await run_in_threadpool(self.project(request).rows))
 
     async def thumb(self, request: Request) -> Response:
-        """Return a small picture of a photo."""
+        """Return a picture of a photo, small unless a large one is wanted; an empty one where none can be shown."""
         project, name = self.project(request), request.path_params["name"]
         if name not in project.photos():
             raise HTTPException(404, "there is no such photo")
-        return await _picture(project.source / name, SMALL_PX, upright=True)
+        side = LARGE_PX if "large" in request.query_params else SMALL_PX
+        return await self._picture(project.source / name, side, upright=True)
+
+    async def _picture(self, path: Path, side: int, *, upright: bool = False) -> Response:
+        async with self.pictures:  # all at once would hold up everything else
+            jpeg = await run_in_threadpool(partial(small_jpeg, path, side, upright=upright))
+        kind = "image/jpeg" if jpeg else "image/svg+xml"
+        return Response(jpeg or NO_PICTURE, media_type=kind, headers={"Cache-Control": "private, max-age=3600"})
 
     # what the user wants
 
@@ -173,23 +205,24 @@ class Studio:
         project, name = self.project(request), request.path_params["name"]
         if project.is_linked:
             raise HTTPException(409, "the photos of this project lie in a folder of this machine: add them there")
-        size = int(request.headers.get("content-length", -1))
-        if size < 0:
-            raise HTTPException(411, "the size of the file is missing")
-        if shutil.disk_usage(project.root).free < size + FREE_BYTES:
-            raise HTTPException(507, "the disk is full: remove files or other projects")
-        draft = project.root / f"{DRAFT}{secrets.token_hex(8)}"
-        try:
-            with draft.open("xb") as file:
-                async for part in request.stream():
-                    size -= len(part)
-                    if size < 0:
-                        raise HTTPException(413, "the file is larger than announced")
-                    file.write(part)
+        async with _uploaded(request, project) as draft:
             kept = await run_in_threadpool(project.keep, draft, name)
-        finally:
-            draft.unlink(missing_ok=True)
         return JSONResponse({"name": kept}, 201)
+
+    async def mask(self, request: Request) -> Response:
+        """Return, take or remove the mask of a photo."""
+        project, name = self.project(request), request.path_params["name"]
+        place = project.mask(name)
+        if request.method == "GET":
+            return _file(place)
+        if request.method == "PUT":
+            async with _uploaded(request, project) as draft:
+                place.parent.mkdir(parents=True, exist_ok=True)
+                draft.replace(place)
+        else:
+            place.unlink(missing_ok=True)
+        project.note_masks()
+        return JSONResponse({})
 
     async def remove(self, request: Request) -> Response:
         """Take photos out of a project."""
@@ -210,15 +243,21 @@ class Studio:
         task.add_done_callback(self.background.discard)
 
     async def change(self, request: Request) -> Response:
-        """Change the quality, the side of markers, or the real size between two places."""
+        """Change the title, the quality, the side of markers, the size between two places, or what is level."""
         project, values = self.project(request), await _values(request)
-        if "quality" in values:
-            project.change("", "quality", values["quality"])
-        if "markers" in values:
-            project.change("scale", "markers", values["markers"])
-        if "size" in values:
-            project.change("scale", "distances", [values["size"]] if values["size"] else [])
-            self.jobs.start(project)
+        if "title" in values:
+            project.note(title=str(values["title"])[:LONGEST_NAME])
+        try:
+            if "quality" in values:
+                project.change("", "quality", values["quality"])
+            if "markers" in values:
+                project.change("scale", "markers", values["markers"])
+            for name, key in (("size", "distances"), ("level", "level")):
+                if name in values:
+                    project.change("scale", key, [values[name]] if values[name] else [])
+                    self.jobs.start(project)
+        except ConfigError as err:  # its hint is for the command line
+            raise HTTPException(400, str(err)) from err
         return JSONResponse({})
 
     async def act(self, request: Request) -> Response:
@@ -237,7 +276,13 @@ class Studio:
         project, values = self.project(request), await _values(request)
         if values.get("format") not in FORMATS:
             raise HTTPException(400, f"no format is named so; known: {', '.join(FORMATS)}")
-        line = await self.jobs.export(project, values["format"])
+        box = values.get("box")
+        if (
+            box is not None
+            and [[type(value) in (int, float) for value in corner] for corner in box] != [[True] * 3] * 2
+        ):
+            raise HTTPException(400, "a box is two corners of three numbers")
+        line = await self.jobs.export(project, values["format"], box)
         if line.get("end") != "done":
             return JSONResponse({"message": line.get("message", ""), "hint": line.get("hint", "")}, 400)
         return JSONResponse({"file": line["file"]})
@@ -248,7 +293,7 @@ class Studio:
         """Return an exported file, or the report."""
         project, name = self.project(request), request.path_params["name"]
         if name == "report.html":
-            return _file(project.out / name, download=f"{project.name}.html")
+            return _file(project.out / name, download=f"{project.title}.html")
         files = {path.relative_to(project.exports).as_posix(): path for path in project.exports.rglob("*")}
         return _file(files.get(name), download=Path(name).name)
 
@@ -256,16 +301,32 @@ class Studio:
         """Return a file of the 3D view: its page, points, pictures and models."""
         project = self.project(request)
         kind, _, number = str(request.path_params["name"]).partition("/")
+        if not kind:
+            return HTMLResponse(await run_in_threadpool(_view_page, project))
         if kind in VIEW_FILES:
             return _file(project.root / VIEW_FILES[kind])
         if not number.isdecimal() or len(number) > 6:
             raise HTTPException(404, "there is nothing at this address")
-        if kind == "points":
-            return _file(project.view / kind / str(int(number)))
-        names = project.result().get("names", [])
-        if kind not in ("pictures", "photos") or int(number) >= len(names):
+        if kind in ("points", DEPTHS):
+            return _file(project.view / kind / (number if kind == "points" else f"{number}.jpg"))
+        result = project.result()
+        names = result.get("names", [])
+        if kind not in ("pictures", "photos") or int(number) >= len(result.get("photos", ())):
             raise HTTPException(404, "there is nothing at this address")
-        return await _picture(project.out / "photos" / names[int(number)], SMALL_PX if kind == "pictures" else LARGE_PX)
+        if int(number) >= len(names):  # it is left out
+            return Response(NO_PICTURE, media_type="image/svg+xml")
+        return await self._picture(
+            project.out / "photos" / names[int(number)], SMALL_PX if kind == "pictures" else LARGE_PX
+        )
+
+
+def _view_page(project: Project) -> str:
+    """Return the page of the 3D view: scripts and page are of one version, whenever the data was written."""
+    try:
+        data = (project.view / VIEW_DATA).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise HTTPException(404, "there is nothing to see yet") from None
+    return TEMPLATES.get_template("studio_view.html.jinja").render(data=Markup(data), studio=True)  # noqa: S704 - escaped
 
 
 async def _values(request: Request) -> dict[str, Any]:
@@ -275,11 +336,25 @@ async def _values(request: Request) -> dict[str, Any]:
     return values
 
 
-async def _picture(path: Path, side: int, *, upright: bool = False) -> Response:
-    jpeg = await run_in_threadpool(partial(small_jpeg, path, side, upright=upright))
-    if not jpeg:
-        raise HTTPException(404, "it has no picture")
-    return Response(jpeg, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=3600"})
+@contextlib.asynccontextmanager
+async def _uploaded(request: Request, project: Project) -> AsyncIterator[Path]:
+    """Write the body of a request into a file, which goes unless it is moved."""
+    size = int(request.headers.get("content-length", -1))
+    if size < 0:
+        raise HTTPException(411, "the size of the file is missing")
+    if shutil.disk_usage(project.root).free < size + FREE_BYTES:
+        raise HTTPException(507, "the disk is full: remove files or other projects")
+    draft = project.root / f"{DRAFT}{secrets.token_hex(8)}"
+    try:
+        with draft.open("xb") as file:
+            async for part in request.stream():
+                size -= len(part)
+                if size < 0:
+                    raise HTTPException(413, "the file is larger than announced")
+                file.write(part)
+        yield draft
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 def _file(path: Path | None, download: str = "") -> Response:
@@ -328,6 +403,7 @@ def make_app(folder: Path, token: str, port: int, *, any_host: bool = False) -> 
         Route(f"{at}/photos", studio.remove, methods=["DELETE"]),
         Route(f"{at}/photos/{{name:path}}", studio.thumb),
         Route(f"{at}/files/{{name:path}}", studio.upload, methods=["PUT"]),
+        Route(f"{at}/masks/{{name:path}}", studio.mask, methods=["GET", "PUT", "DELETE"]),
         Route(f"{at}/check", studio.check, methods=["POST"]),
         Route(f"{at}/exports", studio.export, methods=["POST"]),
         Route(f"{at}/exports/{{name:path}}", studio.download),

@@ -2,7 +2,7 @@
 
     python -m sfm_app.studio.worker run PROJECT
     python -m sfm_app.studio.worker check PROJECT
-    python -m sfm_app.studio.worker export PROJECT FORMAT
+    python -m sfm_app.studio.worker export PROJECT FORMAT BOX
 
 It ends as with Ctrl-C when its input ends: with the server, or because the server wants it to.
 """
@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from sfm_app.api import export_model, export_scene, open_run, reconstruct
+from sfm_app.colmap.dense import names_of_estimates
 from sfm_app.errors import SfmError
 from sfm_app.files import MANIFEST, replace_atomically, save_files
 from sfm_app.operating_system import heed_requests_to_end, interrupt_main_thread, watch_parent
@@ -26,13 +27,14 @@ from sfm_app.pipeline import NAMES
 from sfm_app.plugins import load_plugins
 from sfm_app.progress import UP_TO_DATE, Step
 from sfm_app.report.findings import PhotoRow, glance, photo_names, photo_rows, remarks
-from sfm_app.report.page import headline, read_run, render_view, three_script
+from sfm_app.report.page import headline, page_data, read_run, three_script
+from sfm_app.report.pictures import draw_depths
 from sfm_app.report.scene_view import view_points
 from sfm_app.report.server import RunResources
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.cost_estimate import Plan, choose_plan, minutes_text
 from sfm_app.settings import QUALITY_PRESETS, Settings
-from sfm_app.studio.projects import Project
+from sfm_app.studio.projects import DEPTHS, VIEW_DATA, Project
 
 EVERY_S = 0.25
 """Seconds between two lines about the same work. Chosen by hand."""
@@ -40,6 +42,8 @@ PLANNED = NAMES[1:]
 """Stages whose costs are known once the photos are."""
 SHOWN_BEFORE = (NAMES[1], "depth_maps")
 """Stages before which the page gets what is new: the photos, then the points; the model follows at the end."""
+DEPTHS_EVERY_S = 2.0
+"""Seconds between two looks for new depth maps. Chosen by hand."""
 LATE_MIN = 0.5
 """Minutes beyond its plan from which on a stage is late. Chosen by hand."""
 
@@ -55,7 +59,8 @@ class Reporter:
     def __init__(self, project: Project) -> None:
         self.project, self.last_s, self.begun_s = project, 0.0, 0.0
         self.plan: Plan | None = None
-        self.stage = ""
+        self.stage, self.depths, self.looked_s = "", dict[str, int](), 0.0
+        shutil.rmtree(project.view / DEPTHS, ignore_errors=True)
 
     def __call__(self, step: Step) -> None:
         """Pass a step on."""
@@ -64,12 +69,25 @@ class Reporter:
             self.stage, self.begun_s = step.stage, now
             if step.label != UP_TO_DATE and step.stage in SHOWN_BEFORE:
                 self.plan = _show(self.project)
+        if step.stage == "depth_maps" and now - self.looked_s > DEPTHS_EVERY_S:
+            self._show_depths()
+            self.looked_s = time.monotonic()
         is_message = not begins and not step.total
         if not begins and not is_message and step.done < step.total and now - self.last_s < EVERY_S:
             return
         self.last_s = now
         more = {"message": step.label} if is_message else {"done": step.done, "total": step.total}
         say(stage=step.stage, minutes=self._minutes_left(step, now), **more)
+
+    def _show_depths(self) -> None:
+        """Write pictures of the depth maps that are new: first estimates, which other photos do not confirm yet."""
+        dense, folder = self.project.out / "dense", self.project.view / DEPTHS
+        for name in names_of_estimates(dense):
+            picture = draw_depths(dense, name, "photometric") if name not in self.depths else None
+            if picture is not None:
+                save_files({f"{len(self.depths)}.jpg": picture.jpeg}, folder)
+                self.depths[name] = len(self.depths)
+        say(depths=len(self.depths))
 
     def _minutes_left(self, step: Step, now: float) -> float | None:
         """Return the planned minutes that are left; None where they are not known, or the stage takes longer."""
@@ -119,7 +137,7 @@ def _write_view(project: Project, run: RunContext) -> Plan | None:
     files = {"result.json": json.dumps(result).encode("utf-8")}
     view = resources.view()
     if view is not None:
-        files["index.html"] = render_view(view, rows).encode("utf-8")
+        files[VIEW_DATA] = page_data(view, rows).encode("utf-8", "replace")
         files["three.js"] = three_script().encode("utf-8")
         files |= {f"points/{number}": level for number, level in enumerate(resources.levels)}
         light = resources.find("/light.glb")
@@ -131,8 +149,8 @@ def _write_view(project: Project, run: RunContext) -> Plan | None:
 
 def _photo(row: PhotoRow, number: int, project: Project) -> dict[str, Any]:
     """Return the row of a photo with its name as in the project; where several inputs are read, it has the path."""
-    name = row.name.removeprefix(f"{project.source}/")
-    file = name.partition(": ")[0]  # ZIP: MEMBER
+    inputs, name = project.inputs(), row.name.removeprefix(f"{project.source}/")
+    file = inputs[0].name if len(inputs) == 1 and inputs[0].is_file() else name.partition(": ")[0]  # ZIP: MEMBER
     return {"name": name, "file": file, "number": number, "state": row.state, "reason": row.reason}
 
 
@@ -146,15 +164,15 @@ def run_project(project: Project, last: str) -> None:
             _show(project)
 
 
-def export_project(project: Project, file_format: str) -> None:
-    """Write the model in a format into `exports/`: one file, or a ZIP archive of several."""
+def export_project(project: Project, file_format: str, box: str) -> None:
+    """Write the model, or what is in a box as JSON, into `exports/`: one file, or a ZIP archive of several."""
     target = project.exports / file_format
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
     if file_format in load_plugins().exporters:
-        files = list(export_model(project.out, file_format, target / project.name))
+        files = list(export_model(project.out, file_format, target / project.name, box=json.loads(box)))
     else:
-        made = export_scene(project.out, file_format, target / "scene")
+        made = export_scene(project.out, file_format, target / "scene", box=json.loads(box))
         files = sorted(path for path in made.rglob("*") if path.is_file()) if made.is_dir() else [made]
     if len(files) == 1:
         say(file=files[0].relative_to(project.exports).as_posix())

@@ -6,9 +6,13 @@ import shutil
 import stat
 import zipfile
 
+import cv2
+import numpy as np
 import pytest
+import trimesh
 
 import sfm_app
+from sfm_app.studio import jobs as studio_jobs
 from sfm_app.studio.jobs import Jobs
 from sfm_app.studio.projects import IDLE, PAUSED, QUEUED, RUNNING, Projects
 
@@ -60,8 +64,8 @@ def test_photos_become_a_model_that_the_command_line_goes_on_with(jobs, project)
     assert [*dict.fromkeys(views)] == [(False, False), (True, False), (True, True)]  # the points came first
     placed = [row["name"] for row in project.result()["photos"] if row["state"] == "placed"]
     assert len(placed) == len(project.result()["names"])
-    page = (project.view / "index.html").read_text()
-    assert "<script>" not in page and (project.view / "points" / "0").stat().st_size % 15 == 0
+    data = json.loads((project.view / "view.json").read_text())
+    assert len(data["view"]["cameras"]) == len(placed) and (project.view / "points" / "0").stat().st_size % 15 == 0
 
     before = (project.out / "model.glb").read_bytes()
     steps = []
@@ -71,10 +75,15 @@ def test_photos_become_a_model_that_the_command_line_goes_on_with(jobs, project)
     assert (project.out / "model.glb").read_bytes() == before
     assert all(step.label == "up to date" for step in steps if step.stage and not step.total)
 
-    exported = asyncio.run(jobs.export(project, "obj"))
+    pictures = sorted(path.name for path in (project.view / "depths").iterdir())
+    assert len(pictures) == jobs.progress["court"].depths > 0 and pictures[0] == "0.jpg"
+
+    exported = asyncio.run(jobs.export(project, "obj", None))
     with zipfile.ZipFile(project.exports / exported["file"]) as archive:
         assert {name.rpartition(".")[2] for name in archive.namelist()} == {"obj", "mtl", "jpg"}
-    refused = asyncio.run(jobs.export(jobs.projects.create("empty"), "obj"))
+    part = asyncio.run(jobs.export(project, "ply", [[-0.2, -9, -9], [9, 9, 9]]))
+    assert min(trimesh.load(project.exports / part["file"]).vertices[:, 0]) >= -0.2
+    refused = asyncio.run(jobs.export(jobs.projects.create("empty"), "obj", None))
     assert refused["end"] == "failed" and refused["hint"]
 
 
@@ -123,6 +132,37 @@ def test_photos_of_an_archive_have_their_states_and_pictures(jobs, project):
     names = project.result()["names"]
     for photo in photos[3:]:
         assert names[rows[f"rest.zip: {photo.name}"][1]] == f"rest/{photo.name}"
+
+
+def test_frames_of_a_video_have_their_states_and_pictures(jobs):
+    project = jobs.projects.create("film")
+    project.source.mkdir()
+    writer = cv2.VideoWriter(str(project.source / "film.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5.0, (320, 240))
+    texture = cv2.resize(np.random.default_rng(0).integers(0, 255, (60, 120, 3), np.uint8), (960, 480))
+    for shift in range(0, 600, 30):
+        writer.write(texture[100:340, shift : shift + 320])
+    writer.release()
+    asyncio.run(jobs.check(project))
+    rows = {row["name"]: row for row in project.rows()}
+    assert rows.pop("film.avi")["state"] == "read" and len(rows) > 1
+    assert {(row["file"], row["can_mask"]) for row in rows.values()} == {("film.avi", False)}
+    assert {project.result()["names"][row["number"]] for row in rows.values() if row["state"] == "usable"} <= set(rows)
+
+
+def test_checks_that_wait_are_one(jobs, project):
+    seen = []
+
+    async def count(follow, job, project, *rest):
+        seen.append(job)
+        await asyncio.sleep(0.05)
+
+    async def ask_often():
+        await asyncio.gather(*(jobs.check(project) for _ in range(20)))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(studio_jobs, "_work", count)
+        asyncio.run(ask_often())
+    assert seen == ["check", "check"]  # the one at work, and one for all that came later
 
 
 def bomb(archive):

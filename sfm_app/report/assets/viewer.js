@@ -16,6 +16,7 @@
     return;
   }
   renderer.outputEncoding = THREE.sRGBEncoding;
+  renderer.localClippingEnabled = true;
   renderer.setClearColor(0xeceae8);
   const scene = new THREE.Scene();
   scene.add(new THREE.HemisphereLight(0xffffff, 0x888888, 1.2));
@@ -26,7 +27,7 @@
 
   // orbit: angles in radians, distance from the target; a fly-to ends in a pose of its own until the user turns again
   const orbit = { target: home.clone(), turn: 0.6, tilt: 0.45, distance: 1.6 * size };
-  let flying = null, held = false, dirty = true;
+  let flying = null, held = false, moved = false, dirty = true; // moved: by the user, who then keeps the view
 
   function place() {
     const flat = Math.cos(orbit.tilt);
@@ -43,6 +44,7 @@
   // continue from where the eye is now, after a flight
   function takeOver() {
     flying = null;
+    moved = true;
     if (!held) return;
     held = false;
     const ahead = new THREE.Vector3(0, 0, -1).applyQuaternion(eye.quaternion);
@@ -54,13 +56,37 @@
     eye.updateProjectionMatrix();
   }
 
+  // of the whole photo of a camera
+  const fieldDeg = (one) => THREE.MathUtils.radToDeg(2 * Math.atan(Math.max(one.down, one.across / eye.aspect)));
+
+  // from in front, as near as nearly everything is seen
   function showAll() {
-    flying = null; held = false;
+    flying = null; held = false; moved = false;
     Object.assign(orbit, { turn: startTurn(), tilt: 0.35, distance: 1.15 * size });
     orbit.target.copy(home);
     eye.fov = 50;
     eye.updateProjectionMatrix();
     place();
+    const seen = places();
+    if (!seen.length) return;
+    eye.updateMatrixWorld();
+    for (const at of seen) at.applyMatrix4(eye.matrixWorldInverse);
+    const part = (values, share) => values.sort((a, b) => a - b)[Math.floor(share * (values.length - 1))];
+    const middle = new THREE.Vector3(...["x", "y", "z"].map((axis) => (part(seen.map((at) => at[axis]), 0.03) + part(seen.map((at) => at[axis]), 0.97)) / 2));
+    const tall = Math.tan(THREE.MathUtils.degToRad(eye.fov / 2));
+    const away = seen.map((at) => at.sub(middle)).map(({ x, y, z }) => z + Math.max(Math.abs(x) / eye.aspect, Math.abs(y)) / tall);
+    orbit.distance = Math.max(1.05 * part(away, 0.97), size / 20);
+    orbit.target.copy(middle.applyMatrix4(eye.matrixWorld));
+    place();
+  }
+
+  // some places of the model, or of the points
+  function places() {
+    const found = [], all = [];
+    (model ?? points).traverse((node) => { if (node.geometry) all.push(node.geometry.getAttribute("position")); });
+    const step = Math.ceil(all.reduce((sum, one) => sum + one.count, 0) / 3000);
+    for (const one of all) for (let k = 0; k < one.count; k += step) found.push(new THREE.Vector3().fromBufferAttribute(one, k));
+    return found;
   }
 
   // look from where the cameras stood, on average; where they stood all round, from where the middle one did
@@ -72,6 +98,7 @@
     return middle ? Math.atan2(middle.matrix[8], middle.matrix[10]) : 0.6;
   }
 
+  let model = null;
   // points: in the page, or in levels from coarse to fine that are loaded when they are shown
   const points = new THREE.Group(), dots = new THREE.PointsMaterial({ vertexColors: true, size: 2.5, sizeAttenuation: false });
   const toLinear = Float32Array.from({ length: 256 }, (_, k) => new THREE.Color(k / 255, 0, 0).convertSRGBToLinear().r);
@@ -93,6 +120,7 @@
       const count = view.levels[nextLevel], data = await load(`points/${nextLevel}`, `points, level ${nextLevel + 1} of ${view.levels.length}`);
       if (!data) break;
       addPoints(new Float32Array(data, 0, 3 * count), new Uint8Array(data, 12 * count));
+      if (!nextLevel && !model && !moved) showAll();
       nextLevel += 1;
     }
     loadingPoints = false;
@@ -138,7 +166,6 @@
   scene.add(frusta);
 
   // model
-  let model = null;
   const tick = (id, on) => byId(id).addEventListener("change", (event) => { on(event.target.checked); dirty = true; });
   tick("show-points", (on) => { points.visible = on; loadPoints(); });
   tick("show-cameras", (on) => { frusta.visible = on; });
@@ -156,6 +183,8 @@
       for (const node of lines) node.parent.remove(node); // the file's own cameras: these here can be chosen
       if (model) discard(model);
       model = found.scene;
+      if (!moved) showAll();
+      clip(planes);
       model.visible = byId("show-model").checked;
       scene.add(model);
       dirty = true;
@@ -197,15 +226,28 @@
     else withoutModel();
   }
 
-  // choosing a camera
+  // what is behind one of the planes is not drawn
+  let planes = [];
+  function clip(wanted) {
+    planes = wanted;
+    dots.clippingPlanes = planes;
+    model?.traverse((node) => { if (node.material) node.material.clippingPlanes = planes; });
+    dirty = true;
+  }
+
+  // choosing a camera, whose photo can be beside the model
+  let chosen = -1;
+  const stage = canvas.parentElement;
   function choose(number, fly) {
+    chosen = number;
     for (const lines of frusta.children) lines.material = lines.userData.number === number ? marked : usual;
     const one = view.cameras[number], photo = photos[one.row];
     const row = document.querySelector(`tr[data-row="${one.row}"] img`);
     byId("chosen").hidden = false;
-    byId("chosen-picture").src = row ? row.src : "";
-    byId("chosen-picture").dataset.large = view.photos && row ? `${view.photos}/${one.row}` : "";
-    byId("chosen-picture").alt = `The photo ${one.name}`;
+    const picture = byId("chosen-picture"), large = view.photos ? `${view.photos}/${one.row}` : "";
+    picture.dataset.large = large;
+    picture.src = stage.classList.contains("twin") && large ? large : row ? row.src : view.photos ? `pictures/${one.row}` : "";
+    picture.alt = `The photo ${one.name}`;
     const more = photo && photo.points !== undefined ? `${photo.points} points, ${(photo.residual_px ?? 0).toFixed(2)} px` : "";
     byId("chosen-text").textContent = [one.name, more].filter(Boolean).join(" · ");
     canvas.dataset.chosen = one.name;
@@ -214,10 +256,10 @@
   }
 
   function flyTo(one) {
+    moved = true;
     const matrix = new THREE.Matrix4().fromArray(one.matrix), to = { position: new THREE.Vector3(), turn: new THREE.Quaternion() };
     matrix.decompose(to.position, to.turn, new THREE.Vector3());
-    const aspect = eye.aspect, tall = Math.max(one.down, one.across / aspect);
-    flying = { from: { position: eye.position.clone(), turn: eye.quaternion.clone(), fov: eye.fov }, to, fov: THREE.MathUtils.radToDeg(2 * Math.atan(tall)), start: performance.now() };
+    flying = { from: { position: eye.position.clone(), turn: eye.quaternion.clone(), fov: eye.fov }, to, fov: fieldDeg(one), start: performance.now() };
     held = true;
   }
 
@@ -236,11 +278,11 @@
 
   // pointer, wheel, keys
   const fingers = new Map();
-  let moved = 0, apart = 0;
+  let dragged = 0, apart = 0;
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
     fingers.set(event.pointerId, [event.offsetX, event.offsetY]);
-    moved = 0; apart = 0;
+    dragged = 0; apart = 0;
   });
   canvas.addEventListener("pointermove", (event) => {
     const before = fingers.get(event.pointerId);
@@ -249,8 +291,8 @@
       return;
     }
     const dx = event.offsetX - before[0], dy = event.offsetY - before[1];
-    moved += Math.hypot(dx, dy);
-    if (moved < 5 && fingers.size === 1) return; // a click, so far
+    dragged += Math.hypot(dx, dy);
+    if (dragged < 5 && fingers.size === 1) return; // a click, so far
     takeOver();
     fingers.set(event.pointerId, [event.offsetX, event.offsetY]);
     if (fingers.size === 2) {
@@ -267,7 +309,7 @@
   const lift = (event) => {
     const last = fingers.get(event.pointerId);
     fingers.delete(event.pointerId);
-    if (last && moved < 5 && event.type === "pointerup" && fingers.size === 0) {
+    if (last && dragged < 5 && event.type === "pointerup" && fingers.size === 0) {
       if (viewer.onTap?.(event.offsetX, event.offsetY)) return;
       const number = nearestCamera(event.offsetX, event.offsetY);
       if (number >= 0) choose(number, true);
@@ -288,10 +330,11 @@
       ArrowLeft: () => (shift ? pan(30, 0) : turn(-0.1, 0)), ArrowRight: () => (shift ? pan(-30, 0) : turn(0.1, 0)),
       ArrowUp: () => (shift ? pan(0, 30) : turn(0, 0.08)), ArrowDown: () => (shift ? pan(0, -30) : turn(0, -0.08)),
       "+": () => zoom(0.85), "=": () => zoom(0.85), "-": () => zoom(1.18), 0: showAll,
+      n: () => step(1), p: () => step(-1),
     };
     if (!(event.key in keys)) return;
     event.preventDefault();
-    if (event.key !== "0") takeOver();
+    if (!"0np".includes(event.key)) takeOver();
     keys[event.key]();
   });
   function turn(across, up) {
@@ -310,8 +353,19 @@
     place();
   }
   byId("show-all").addEventListener("click", showAll);
+  function beside(on) {
+    stage.classList.toggle("twin", on);
+    byId("chosen-beside").setAttribute("aria-pressed", String(on));
+    fit();
+    if (on) choose(chosen, true);
+  }
+  const step = (by) => choose((Math.max(chosen, -by) + by + view.cameras.length) % view.cameras.length, true);
+  byId("chosen-beside").addEventListener("click", () => beside(!stage.classList.contains("twin")));
+  byId("chosen-before").addEventListener("click", () => step(-1));
+  byId("chosen-after").addEventListener("click", () => step(1));
   byId("chosen-close").addEventListener("click", () => {
     byId("chosen").hidden = true;
+    beside(false);
     for (const lines of frusta.children) lines.material = usual;
     dirty = true;
     canvas.focus();
@@ -344,7 +398,12 @@
     const at = point.clone().project(eye);
     return at.z > 1 ? null : [((at.x + 1) / 2) * canvas.clientWidth, ((1 - at.y) / 2) * canvas.clientHeight];
   }
-  const viewer = { view, canvas, pick, project, redraw: () => { dirty = true; }, onTap: null, onDraw: null };
+  // corners of what is drawn: of the model, or of the points
+  function bounds() {
+    const box = new THREE.Box3().setFromObject(model ?? points);
+    return [box.min, box.max];
+  }
+  const viewer = { view, canvas, scene, eye, pick, project, clip, bounds, redraw: () => { dirty = true; }, onTap: null, onDraw: null };
   window.sfmViewer = viewer;
 
   // rows of the table fly to their camera
@@ -367,6 +426,7 @@
     renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     renderer.setSize(width, height, false);
     eye.aspect = width / height;
+    if (held && !flying) eye.fov = fieldDeg(view.cameras[chosen]);
     eye.updateProjectionMatrix();
     dirty = true;
   }

@@ -1,22 +1,13 @@
 // The page of the studio: a list of projects, and one project. State comes from the server, once a second.
+import { make } from "./elements.js";
+import { editMask } from "./mask.js";
 import { texts } from "./texts.js";
 
 const main = document.getElementById("main"), alertBox = document.getElementById("alert");
+const CROPPED = ["glb", "obj", "stl", "usdz", "ply", "laz"]; // formats that a box cuts
 const STAGES = Object.keys(texts.stages);
 document.title = texts.title;
 document.getElementById("home").textContent = texts.title;
-
-// an element: properties, attributes where they have a dash, listeners where they begin with "on"; then what it contains
-function make(tag, properties = {}, ...content) {
-  const element = document.createElement(tag);
-  for (const [name, value] of Object.entries(properties)) {
-    if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
-    else if (name.includes("-") || name === "role" || name === "for") element.setAttribute(name, value);
-    else element[name] = value;
-  }
-  element.append(...content.filter((one) => one !== null && one !== undefined && one !== ""));
-  return element;
-}
 
 function warn(text) {
   alertBox.textContent = text;
@@ -81,9 +72,10 @@ function dropZone(onFiles, title) {
 // a file beside the zone would take the place of the page
 for (const kind of ["dragover", "drop"]) window.addEventListener(kind, (event) => event.preventDefault());
 
-const uploads = new Map(); // by project: files done and all
+const CHECK_EVERY_MS = 4000;
+const uploads = new Map(); // by project: files done and all, and when they were checked
 async function upload(project, files) {
-  const count = uploads.get(project) ?? { done: 0, all: 0 };
+  const count = uploads.get(project) ?? { done: 0, all: 0, checked: performance.now() };
   uploads.set(project, count);
   count.all += files.length;
   const waiting = [...files];
@@ -96,6 +88,9 @@ async function upload(project, files) {
       }
       count.done += 1;
       shown?.refresh();
+      if (performance.now() - count.checked < CHECK_EVERY_MS) continue;
+      count.checked = performance.now();
+      ask("POST", `${path(project)}/check`).catch(() => {});
     }
   };
   await Promise.all([next(), next(), next()]);
@@ -112,8 +107,8 @@ async function showProjects() {
   if (location.hash.length > 1) return; // meanwhile, the user has gone to a project
   const fresh = async (files) => {
     if (!files.length) return;
-    const folder = files[0].webkitRelativePath.split("/")[0];
-    const { name } = await ask("POST", "", { name: folder || files[0].name.replace(/\.[^.]*$/, "") });
+    const folder = files[0].webkitRelativePath.split("/")[0], single = files.length === 1 ? files[0].name.replace(/\.[^.]*$/, "") : "";
+    const { name } = await ask("POST", "", { name: folder || single || texts.newName });
     location.hash = encodeURIComponent(name);
     upload(name, files);
   };
@@ -138,7 +133,7 @@ async function showProjects() {
 function card(project) {
   const picture = project.has_picture && make("img", { alt: "", loading: "lazy", src: `/api/projects${path(project.name)}/view/pictures/0` });
   const state = texts.states[project.state] || project.headline;
-  return make("li", {}, make("a", { href: `#${encodeURIComponent(project.name)}` }, picture || make("span", { className: "blank" }), make("b", {}, project.name), make("small", {}, state)));
+  return make("li", {}, make("a", { href: `#${encodeURIComponent(project.name)}` }, picture || make("span", { className: "blank" }), make("b", {}, project.title), make("small", {}, state)));
 }
 
 // One project. Its parts are made once, and filled with what the server says.
@@ -155,18 +150,20 @@ class ProjectPage {
     const part = (id, title, ...content) => make("section", { id, "aria-labelledby": `${id}-title` }, make("h2", { id: `${id}-title` }, title), ...content);
     this.parts = {
       status: make("p", { className: "status", role: "status" }), bar: make("progress", { hidden: true, "aria-label": texts.make }),
-      actions: make("p", { className: "actions" }), messages: make("ul", { className: "messages quiet" }), problem: make("div", { className: "problem", hidden: true }),
+      actions: make("p", { className: "actions" }), messages: make("ul", { className: "messages quiet" }), depths: make("div", { className: "depths", role: "img", "aria-label": texts.depths, hidden: true }), problem: make("div", { className: "problem", hidden: true }),
       view: make("div", { hidden: true }), photos: make("ul", { className: "photos" }), photoLine: make("p", {}), warnings: make("div", { hidden: true }),
       size: make("p", {}), facts: make("dl", { className: "facts" }), command: make("code", { tabIndex: 0 }), where: make("p", { className: "quiet" }),
-      form: this.settingsForm(), saves: make("ul", { className: "saves" }),
+      form: this.settingsForm(), masks: this.maskFiles(), saves: make("ul", { className: "saves" }),
     };
     const { parts } = this;
-    this.model = part("model", texts.model, parts.facts, parts.view, parts.size, parts.warnings);
+    this.model = part("model", texts.model, parts.view, parts.size, parts.warnings, parts.facts);
     this.save = part("save", texts.save, parts.saves);
-    this.photos = part("photos", texts.photos, parts.photoLine, parts.photos, dropZone((files) => upload(name, files), texts.add));
-    this.make = part("make", texts.make, parts.problem, parts.form, parts.actions, parts.status, parts.bar, parts.messages);
-    const end = part("end", texts.command, parts.command, parts.where, make("p", {}, make("button", { type: "button", className: "risky", onclick: () => this.delete() }, texts.delete)));
-    main.replaceChildren(make("h1", {}, name), this.make, this.model, this.save, this.photos, end);
+    this.photos = part("photos", texts.photos, parts.photoLine, parts.photos, dropZone((files) => upload(name, files), texts.add), parts.masks);
+    this.make = part("make", texts.make, parts.problem, parts.form, parts.actions, parts.status, parts.bar, parts.messages, parts.depths);
+    const button = (text, act, className = "") => make("button", { type: "button", className, onclick: act }, text);
+    const end = part("end", texts.command, parts.command, parts.where, make("p", { className: "actions" }, button(texts.rename, () => this.rename()), button(texts.delete, () => this.delete(), "risky")));
+    this.title = make("h1", {}, name);
+    main.replaceChildren(this.title, this.make, this.model, this.save, this.photos, end);
     this.refresh();
     this.timer = setInterval(() => this.refresh(), 1000);
   }
@@ -186,6 +183,18 @@ class ProjectPage {
     );
   }
 
+  maskFiles() {
+    const input = make("input", {
+      type: "file", multiple: true, hidden: true, accept: "image/*",
+      onchange: async () => {
+        for (const file of input.files) await ask("PUT", `${this.at}/masks${path(file.name)}`, file).catch(() => {});
+        this.listed = "";
+        this.refresh();
+      },
+    });
+    return make("p", { className: "quiet" }, input, make("button", { type: "button", onclick: () => input.click() }, texts.addMasks), " ", texts.masksHelp);
+  }
+
   async refresh() {
     if (this.busy) return;
     this.busy = true;
@@ -201,16 +210,22 @@ class ProjectPage {
   async fill(state) {
     const { parts } = this, { state: wanted } = state, working = wanted === "running", count = uploads.get(this.name);
     this.fillActions(wanted, state, count);
+    this.placeMaking(state.has_model && !working && wanted !== "queued");
     const number = STAGES.indexOf(state.stage);
     const stage = number < 0 ? texts.starting : texts.stage(number + 1, STAGES.length, texts.stages[state.stage]);
     const left = number < 1 ? "" : state.minutes_left === null ? texts.longer : texts.left(state.minutes_left);
-    setText(parts.status, count ? texts.uploading(count.done, count.all) : working ? [stage, state.total > 1 ? texts.of(state.done, state.total) : "", left].filter(Boolean).join(", ") : texts[wanted] ?? (state.has_model ? texts.finished : state.photos && !state.minutes && !state.failure ? texts.checking : ""));
+    setText(parts.status, count ? texts.uploading(count.done, count.all) : working ? [stage, state.total > 1 ? texts.of(state.done, state.total) : "", left].filter(Boolean).join(", ") : texts[wanted] ?? (state.has_model ? texts.finished(state.quality) : state.photos && !state.minutes && !state.failure ? texts.checking : ""));
     parts.bar.hidden = !count && !working;
     const part = count ? count.done / count.all : (Math.max(number, 0) + (state.total ? state.done / state.total : 0)) / STAGES.length;
-    parts.bar.value = part;
+    parts.bar.value = working && !count ? Math.max(part, this.reached ?? 0) : part; // a stage counts several times
+    this.reached = working ? parts.bar.value : 0;
     setList(parts.messages, working ? state.messages.slice(-5) : []);
     const problem = state.problem ?? (state.failure ? { message: state.failure, hint: state.hint } : null);
-    parts.problem.hidden = !problem || working;
+    parts.problem.hidden = !problem || working || Boolean(count);
+    parts.form.hidden = working || wanted === "queued";
+    setText(this.title, state.title);
+    document.title = `${state.title} – ${texts.title}`;
+    this.fillDepths(working ? state.depths : 0);
     if (problem) parts.problem.replaceChildren(make("h3", {}, texts.failed), make("p", {}, problem.message), make("p", {}, problem.hint ? texts.toDo(problem.hint) : ""));
     if (document.activeElement !== this.qualities) this.qualities.value = state.quality;
     if (document.activeElement !== this.markers) this.markers.value = state.markers;
@@ -225,8 +240,21 @@ class ProjectPage {
     }
   }
 
+  // a finished model comes first, but while it is made, that does
+  placeMaking(isLast) {
+    const before = isLast ? this.photos : this.title;
+    if (before.nextElementSibling !== this.make) before.after(this.make);
+  }
+
+  fillDepths(count) {
+    const { depths } = this.parts;
+    depths.hidden = !count;
+    while (depths.children.length > count) depths.lastChild.remove();
+    while (depths.children.length < count) depths.append(make("img", { alt: "", src: `/api/projects${this.at}/view/depths/${depths.children.length}` }));
+  }
+
   fillActions(wanted, state, count) {
-    const act = (name, text) => make("button", { type: "button", className: name === "start" ? "main" : "", onclick: async () => { await ask("POST", `${this.at}/${name}`); this.refresh(); } }, text);
+    const act = (name, text) => make("button", { type: "button", className: name === "start" ? "main" : "", onclick: async () => { await ask("POST", `${this.at}/${name}`); await this.refresh(); this.make.scrollIntoView({ block: "nearest" }); } }, text);
     const buttons = wanted === "running" ? [["pause", texts.pause], ["cancel", texts.cancel]] : wanted === "queued" ? [["cancel", texts.cancel]] : state.photos && !count ? [["start", wanted === "paused" ? texts.go : state.has_model ? texts.redo : texts.start]] : [];
     const key = JSON.stringify(buttons);
     if (key === this.buttons) return;
@@ -251,16 +279,19 @@ class ProjectPage {
       this.warnings = warnings;
       parts.warnings.replaceChildren(make("h3", {}, texts.warnings), make("ul", {}, ...(state.warnings ?? []).map((text) => make("li", {}, text))));
     }
-    const size = `${state.has_model}${JSON.stringify(state.sizes)}`;
+    const size = JSON.stringify([state.has_model, state.sizes, state.level]);
     if (size !== this.sizeState) {
       this.sizeState = size;
-      const forget = make("button", { type: "button", onclick: () => ask("PATCH", this.at, { size: null }) }, texts.forget);
-      parts.size.replaceChildren(...(!state.has_model ? [texts.pointsOnly] : state.sizes.length ? [texts.sizeKnown, " ", forget] : [texts.sizeHelp]));
+      const forget = (key, text) => make("button", { type: "button", onclick: () => ask("PATCH", this.at, { [key]: null }) }, text);
+      const sized = state.sizes.length ? [texts.sizeKnown, " ", forget("size", texts.forget)] : [texts.sizeHelp];
+      const upright = state.level.length ? [texts.levelKnown, " ", forget("level", texts.forgetLevel)] : [texts.levelHelp];
+      parts.size.replaceChildren(...(state.has_model ? [...sized, " ", ...upright] : [texts.pointsOnly]));
       this.fillSaves();
     }
   }
 
   fillSaves() {
+    const { parts } = this;
     const save = (format, text) => {
       const button = make("button", {
         type: "button", "data-format": format,
@@ -268,7 +299,8 @@ class ProjectPage {
           button.disabled = true;
           button.textContent = texts.writing;
           try {
-            const { file } = await ask("POST", `${this.at}/exports`, { format });
+            const box = CROPPED.includes(format) ? parts.view.querySelector("iframe")?.contentWindow.sfmViewer?.box?.() : null;
+            const { file } = await ask("POST", `${this.at}/exports`, { format, box });
             download(`/api/projects${this.at}/exports/${file.split("/").map(encodeURIComponent).join("/")}`);
           } catch { // the alert says it
           } finally {
@@ -280,12 +312,12 @@ class ProjectPage {
       return make("li", {}, text, " ", button);
     };
     const report = make("li", {}, texts.report, " ", make("button", { type: "button", onclick: () => download(`/api/projects${this.at}/exports/report.html`) }, texts.download));
-    this.parts.saves.replaceChildren(...Object.entries(texts.formats).map(([name, text]) => save(name, text)), report);
+    parts.saves.replaceChildren(...Object.entries(texts.formats).map(([name, text]) => save(name, text)), report);
   }
 
   fillPhotos(rows, state, working) {
-    const used = rows.filter((row) => row.state !== "left out").length;
-    this.parts.photoLine.replaceChildren(...[rows.length ? texts.count(used, rows.length) : "", state.source ? texts.linked(state.source) : "", state.has_view ? texts.added : ""].filter(Boolean).map((text) => make("span", {}, `${text} `)));
+    const whole = rows.filter((row) => row.state !== "read"), used = whole.filter((row) => row.state !== "left out").length;
+    this.parts.photoLine.replaceChildren(...[rows.length ? texts.count(used, whole.length) : "", state.source ? texts.linked(state.source) : "", state.has_view ? texts.added : ""].filter(Boolean).map((text) => make("span", {}, `${text} `)));
     // items that say the same stay: there may be hundreds
     const before = new Map([...this.parts.photos.children].map((item) => [item.dataset.key, item]));
     const item = (row) => {
@@ -294,7 +326,10 @@ class ProjectPage {
         "li", { className: row.reason ? "odd" : "", "data-key": key },
         make("img", { loading: "lazy", alt: "", src: `/api/projects${this.at}/${row.name === row.file ? `photos${path(row.name)}` : `view/pictures/${row.number}`}` }),
         make("b", {}, row.name), make("small", {}, [texts.photoStates[row.state] ?? row.state, row.reason].filter(Boolean).join(": ")),
-        working || row.name !== row.file ? null : make("button", { type: "button", "aria-label": texts.removeOf(row.name), title: texts.remove, onclick: (event) => this.remove(row.name, event.target.closest("li")) }, "×"),
+        ...(working || row.name !== row.file ? [] : [
+          make("button", { type: "button", className: "out", "aria-label": texts.removeOf(row.name), title: texts.remove, onclick: (event) => this.remove(row.name, event.target.closest("li")) }, "×"),
+          row.can_mask && make("button", { type: "button", "aria-label": `${row.masked ? texts.masked : texts.mask} ${row.name}`, onclick: () => this.paint(row) }, row.masked ? texts.masked : texts.mask),
+        ]),
       );
     };
     const wanted = rows.map(item), kept = new Set(wanted);
@@ -308,8 +343,27 @@ class ProjectPage {
     this.refresh();
   }
 
+  async paint(row) {
+    const mask = `${this.at}/masks${path(row.name)}`;
+    let made;
+    try {
+      made = await editMask(row.name, `/api/projects${this.at}/photos${path(row.name)}?large`, row.masked ? `/api/projects${mask}` : "");
+    } catch (error) {
+      warn(error.message);
+    }
+    if (made === undefined) return;
+    await ask(made ? "PUT" : "DELETE", mask, made ?? undefined);
+    this.listed = "";
+    this.refresh();
+  }
+
+  async rename() {
+    const title = window.prompt(texts.newTitle, this.title.textContent);
+    if (title?.trim()) await ask("PATCH", this.at, { title: title.trim() });
+  }
+
   async delete() {
-    if (!window.confirm(texts.sure(this.name))) return;
+    if (!window.confirm(texts.sure(this.title.textContent))) return;
     await ask("DELETE", this.at);
     location.hash = "";
   }
@@ -340,8 +394,7 @@ async function route() {
   shown?.close();
   shown = null;
   const name = decodeURIComponent(location.hash.slice(1));
-  document.getElementById("where").textContent = name;
-  document.title = name ? `${name} – ${texts.title}` : texts.title;
+  document.title = texts.title;
   if (name) shown = new ProjectPage(name);
   else await showProjects();
   main.focus();

@@ -28,7 +28,8 @@ VALUES = {"seed": 3, "workers": 2, "cluster": "local:2",
           "max_memory": 4.0, "quality": "draft", "images": "list.txt", "masks": "masks",
           "cameras": "single", "max_frames": 50, "keep_low_quality": True, "features": "sift-affine", "pairs": "all",
           "estimator": "msac", "calibrator": "kruppa", "calibration": "cameras.txt", "keep_calibration": True,
-          "camera_model": "RADIAL", "mapper": "global", "scale": (("0,0,0", "1,0,0", "1.25m"),), "level": (("0,0,0", "1,0,0", "0,0,1"),), "markers": "50mm",
+          "camera_model": "RADIAL", "mapper": "global", "scale": (("0,0,0", "1,0,0", "1.25m"),),
+          "level": (("0,0,0", "1,0,0", "0,0,1"),), "markers": "50mm",
           "gcp": "gcp_list.txt", "positions": "geo.txt", "faces": 1000,
           "watertight": True, "unseen_faces": "cut"}  # fmt: skip
 """A value other than the default for every flag."""

@@ -157,9 +157,8 @@ def test_meters_are_named():
 def test_a_model_that_may_stand_the_wrong_way_up_comes_with_a_remedy():
     unsure = COUNTS["orientation"] | {"up_sign_odds": 2.3, "up_axis_odds": 900.0, "photos_turned_deg": 270}
     assert "beware: the model may stand upside down (odds 2.3 to 1 against)" in describe(orientation=unsure)[0]
-    assert "run again with --set scene.photo_rotation_deg=90" in describe(orientation=unsure)[0]
     lying = describe(orientation=unsure | {"up_sign_odds": 70.0, "up_axis_odds": 1.5, "photos_turned_deg": 0})[0]
-    assert "upside down" not in lying and "lie on its side" in lying and "scene.photo_rotation_deg=90 or 270" in lying
+    assert "upside down" not in lying and "lie on its side" in lying and "press upright in the 3D view" in lying
     assert "beware" not in describe(orientation=unsure | {"up_sign_odds": 70.0})[0]
 
 

@@ -1,7 +1,9 @@
 """The server of the studio: who may ask, what uploads may do, and that names are never paths."""
 
 import http.client
+import io
 import json
+import re
 import socket
 import threading
 import time
@@ -188,3 +190,88 @@ def test_a_project_is_deleted_with_its_files(ask, jug, photo):
     ask.json("PUT", f"{jug}/files/a.jpg", photo)
     ask.json("DELETE", jug)
     assert ask.json("GET", "/api/projects") == [] and not list(ask.folder.iterdir())
+
+
+def masks_of(ask):
+    return {
+        path.relative_to(ask.folder / "jug" / "masks").as_posix() for path in (ask.folder / "jug").rglob("masks/*.png")
+    }
+
+
+def test_a_mask_belongs_to_a_photo_and_goes_with_it(ask, jug, photo):
+    for name in ("a.jpg", "b.jpg"):
+        ask.json("PUT", f"{jug}/files/{name}", photo + name.encode())
+    ask.json("PUT", f"{jug}/masks/a.jpg", b"painted")
+    ask.json("PUT", f"{jug}/masks/b_mask.png", b"dropped")  # a name as of a folder of masks
+    assert masks_of(ask) == {"a.jpg.png", "b.jpg.png"}
+    assert [row["masked"] for row in ask.json("GET", f"{jug}/photos")] == [True, True]
+    assert ask("GET", f"{jug}/masks/b.jpg")[1] == b"dropped"
+    place = str(ask.folder / "jug" / "masks")
+    assert f"--config {ask.folder / 'jug' / 'settings.toml'}" in ask.json("GET", jug)["command"]
+    assert place in (ask.folder / "jug" / "settings.toml").read_text()
+    ask.json("DELETE", f"{jug}/masks/b.jpg")
+    ask.json("DELETE", f"{jug}/photos", {"names": ["a.jpg"]})  # alone, its mask would be that of all photos
+    assert masks_of(ask) == set() and place not in (ask.folder / "jug" / "settings.toml").read_text()
+
+
+@pytest.mark.parametrize("name", ["c.png", "..%2f..%2foutside", "..%2fproject.json", "a.jpg%2f..%2f..%2fproject.json"])
+def test_a_mask_of_no_photo_is_refused(ask, jug, photo, name):
+    ask.json("PUT", f"{jug}/files/a.jpg", photo)
+    before = sorted(ask.folder.rglob("*"))
+    for method in ("GET", "PUT", "DELETE"):
+        answer, content = ask(method, f"{jug}/masks/{name}", b"x" if method == "PUT" else None)
+        assert answer.status == 400 and json.loads(content)["hint"]
+    assert sorted(ask.folder.rglob("*")) == before
+
+
+def test_only_whole_photos_can_have_a_mask_painted(ask, jug, photo):
+    for name in ("a.jpg", "film.mp4", "pack.zip"):
+        ask.json("PUT", f"{jug}/files/{name}", photo if name == "a.jpg" else b"other")
+    assert {row["name"] for row in ask.json("GET", f"{jug}/photos") if row["can_mask"]} == {"a.jpg"}
+
+
+def test_what_has_no_picture_has_an_empty_one(ask, jug, photo):
+    for name, kind in (("a.jpg", "image/jpeg"), ("film.mp4", "image/svg+xml")):
+        ask.json("PUT", f"{jug}/files/{name}", photo if name == "a.jpg" else b"no picture")
+        answer, content = ask("GET", f"{jug}/photos/{name}")
+        assert (answer.status, answer.getheader("Content-Type")) == (200, kind) and content
+    _, large = ask("GET", f"{jug}/photos/a.jpg?large")
+    assert Image.open(io.BytesIO(large)).size == (120, 90)
+
+
+def test_a_model_is_turned_and_turned_back(ask, jug):
+    level = ["0,0,0", "1,0,0", "0,0,-1"]
+    ask.json("PATCH", jug, {"level": level})
+    assert ask.json("GET", jug)["level"] == [level]
+    ask.json("POST", f"{jug}/cancel")
+    answer, content = ask("PATCH", jug, {"level": ["0,0,0", "1,0,0", "2,0,0"]})
+    assert answer.status == 400 and "on a line" in json.loads(content)["message"]
+    assert ask.json("GET", jug)["state"] == "idle"  # what is wrong starts nothing
+    ask.json("PATCH", jug, {"level": None})
+    assert ask.json("GET", jug)["level"] == []
+
+
+def test_a_project_gets_another_title_and_keeps_its_address(ask, jug):
+    ask.json("PATCH", jug, {"title": "Grandma's <b>jug</b>"})
+    assert [(one["name"], one["title"]) for one in ask.json("GET", "/api/projects")] == [
+        ("jug", "Grandma's <b>jug</b>")
+    ]
+    assert ask.json("GET", jug)["title"] == "Grandma's <b>jug</b>"
+
+
+@pytest.mark.parametrize("box", [[[0, 0]], "x", [[0, 0, 0], ["a", 0, 0]]])
+def test_a_box_that_is_none_is_an_error(ask, jug, box):
+    answer, content = ask("POST", f"{jug}/exports", {"format": "obj", "box": box})
+    assert answer.status == 400 and json.loads(content)["message"] == "a box is two corners of three numbers"
+
+
+def test_the_3d_view_is_of_this_version_whatever_wrote_its_data(ask, jug):
+    assert ask("GET", f"{jug}/view/")[0].status == 404
+    (ask.folder / "jug" / "view").mkdir()
+    (ask.folder / "jug" / "view" / "view.json").write_text('{"view": {"size": 2.5}, "photos": []}')
+    answer, content = ask("GET", f"{jug}/view/")
+    assert (
+        answer.getheader("Content-Type").startswith("text/html") and b'{"view": {"size": 2.5}, "photos": []}' in content
+    )
+    for script in re.findall(rb'src="(/[^"]+)"', content):
+        assert ask("GET", script.decode())[0].status == 200
