@@ -35,6 +35,33 @@ async function ask(method, address, body) {
 
 const path = (...parts) => parts.map((part) => `/${encodeURIComponent(part)}`).join("");
 
+// Pictures are loaded when they are in view, two at a time: a browser has six connections, and the rest of the page needs some.
+
+const MOST_LOADING = 2, wantedPictures = new Set();
+let loading = 0;
+const inView = new IntersectionObserver((entries) => {
+  for (const { target, isIntersecting } of entries) {
+    if (isIntersecting) wantedPictures.add(target);
+    else wantedPictures.delete(target);
+  }
+  loadPictures();
+});
+function loadPictures() {
+  for (const one of wantedPictures) {
+    if (loading === MOST_LOADING) return;
+    wantedPictures.delete(one);
+    inView.unobserve(one);
+    loading += 1;
+    one.onload = one.onerror = () => { loading -= 1; loadPictures(); };
+    one.src = one.dataset.src;
+  }
+}
+function picture(address) {
+  const one = make("img", { alt: "", "data-src": address });
+  inView.observe(one);
+  return one;
+}
+
 // Files: dropped, chosen, or taken with the camera of a telephone.
 
 async function filesOf(entry) {
@@ -131,9 +158,9 @@ async function showProjects() {
 }
 
 function card(project) {
-  const picture = project.has_picture && make("img", { alt: "", loading: "lazy", src: `/api/projects${path(project.name)}/view/pictures/0` });
+  const preview = project.has_picture && picture(`/api/projects${path(project.name)}/view/pictures/0`);
   const state = texts.states[project.state] || project.headline;
-  return make("li", {}, make("a", { href: `#${encodeURIComponent(project.name)}` }, picture || make("span", { className: "blank" }), make("b", {}, project.title), make("small", {}, state)));
+  return make("li", {}, make("a", { href: `#${encodeURIComponent(project.name)}` }, preview || make("span", { className: "blank" }), make("b", {}, project.title), make("small", {}, state)));
 }
 
 // One project. Its parts are made once, and filled with what the server says.
@@ -324,7 +351,7 @@ class ProjectPage {
       const key = JSON.stringify([row, working]);
       return before.get(key) ?? make(
         "li", { className: row.reason ? "odd" : "", "data-key": key },
-        make("img", { loading: "lazy", alt: "", src: `/api/projects${this.at}/${row.name === row.file ? `photos${path(row.name)}` : `view/pictures/${row.number}`}` }),
+        picture(`/api/projects${this.at}/${row.name === row.file ? `photos${path(row.name)}` : `view/pictures/${row.number}`}`),
         make("b", {}, row.name), make("small", {}, [texts.photoStates[row.state] ?? row.state, row.reason].filter(Boolean).join(": ")),
         ...(working || row.name !== row.file ? [] : [
           make("button", { type: "button", className: "out", "aria-label": texts.removeOf(row.name), title: texts.remove, onclick: (event) => this.remove(row.name, event.target.closest("li")) }, "×"),
