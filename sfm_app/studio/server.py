@@ -34,6 +34,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from sfm_app.errors import ConfigError, SfmError
 from sfm_app.operating_system import Ability, lacks
 from sfm_app.photos.decode import small_jpeg
+from sfm_app.photos.files import resolve_file
 from sfm_app.report.listening import HEADERS, LOOPBACK, explain_ports, page_address
 from sfm_app.studio.jobs import Jobs, Progress
 from sfm_app.studio.projects import (
@@ -171,10 +172,10 @@ class Studio:
     async def thumb(self, request: Request) -> Response:
         """Return a picture of a photo, small unless a large one is wanted; an empty one where none can be shown."""
         project, name = self.project(request), request.path_params["name"]
-        if name not in project.photos():
-            raise HTTPException(404, "there is no such photo")
-        side = LARGE_PX if "large" in request.query_params else SMALL_PX
-        return await self._picture(project.source / name, side, upright=True)
+        place = resolve_file(project.source, name)
+        if isinstance(place, str):
+            raise HTTPException(404, f"there is no such photo: {place}")
+        return await self._picture(place, LARGE_PX if "large" in request.query_params else SMALL_PX, upright=True)
 
     async def _picture(self, path: Path, side: int, *, upright: bool = False) -> Response:
         async with self.pictures:  # all at once would hold up everything else

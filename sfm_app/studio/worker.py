@@ -14,6 +14,7 @@ import signal
 import sys
 import time
 import zipfile
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -128,7 +129,7 @@ def _write_view(project: Project, run: RunContext) -> Plan | None:
         "problem": contents.problem,
         "warnings": warnings,
         "facts": [asdict(fact) for fact in glance(contents)],
-        "photos": [_photo(row, number, project) for number, row in enumerate(rows)],
+        "photos": _photo_entries(rows, project),
         "names": resources.names,
         "minutes": {quality: minutes_text(plan.minutes(PLANNED)) for quality, plan in plans.items()},
         "has_view": resources.points is not None,
@@ -147,11 +148,15 @@ def _write_view(project: Project, run: RunContext) -> Plan | None:
     return plans.get(run.settings.quality)
 
 
-def _photo(row: PhotoRow, number: int, project: Project) -> dict[str, Any]:
-    """Return the row of a photo with its name as in the project; where several inputs are read, it has the path."""
-    inputs, name = project.inputs(), row.name.removeprefix(f"{project.source}/")
-    file = inputs[0].name if len(inputs) == 1 and inputs[0].is_file() else name.partition(": ")[0]  # ZIP: MEMBER
-    return {"name": name, "file": file, "number": number, "state": row.state, "reason": row.reason}
+def _photo_entries(rows: Sequence[PhotoRow], project: Project) -> list[dict[str, Any]]:
+    """Return the rows of photos with names and files as in the project; several inputs are read by their paths."""
+    inputs, entries = project.inputs(), []
+    lone = inputs[0].name if len(inputs) == 1 and inputs[0].is_file() else ""
+    for number, row in enumerate(rows):
+        name = row.name.removeprefix(f"{project.source}/")
+        file = lone or name.partition(": ")[0]  # ZIP: MEMBER
+        entries.append({"name": name, "file": file, "number": number, "state": row.state, "reason": row.reason})
+    return entries
 
 
 def run_project(project: Project, last: str) -> None:
