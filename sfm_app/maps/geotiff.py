@@ -1,0 +1,76 @@
+"""Cloud Optimized GeoTIFF by GDAL, tile by tile."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sfm_app.errors import ConfigError
+from sfm_app.files import replace_atomically
+from sfm_app.maps.drawing import Grid, Tile
+
+INSTALL_HINT = "pip install 'sfm-app[maps]'"
+HOLE = -9999.0
+"""Height of holes: GDAL's usual one, below all ground."""
+BLOCK_PX = 512
+"""Side of the blocks of a file, as GDAL's driver has it by default."""
+
+
+@dataclass(frozen=True, slots=True)
+class Georeference:
+    """Where a raster lies."""
+
+    grid: Grid
+    wkt: str
+    """Coordinate system; empty if the size is unknown."""
+    height_unit: str = ""
+    """Unit of heights: "m", "ft" or empty."""
+
+
+def check_rasterio() -> None:
+    """Raise a ConfigError if rasterio, which brings GDAL, is missing or broken."""
+    try:
+        import rasterio  # noqa: F401
+    except ImportError as err:
+        raise ConfigError(f"orthophotos and elevation models need rasterio: {err}", hint=INSTALL_HINT) from None
+
+
+def write_cog(tiles: Iterable[Tile], place: Georeference, target: Path, *, heights: bool) -> None:
+    """Write colors with opacity, or heights, as a Cloud Optimized GeoTIFF; OSError if it cannot be written.
+
+    The same tiles give the same bytes. The tiles go to a plain file first, because the overviews precede the pixels.
+    """
+    import rasterio
+    import rasterio.shutil
+    from rasterio.crs import CRS
+    from rasterio.enums import ColorInterp
+    from rasterio.transform import from_origin
+    from rasterio.windows import Window
+
+    grid = place.grid
+    form = {
+        "driver": "GTiff", "width": grid.width, "height": grid.height, "tiled": True, "blockxsize": BLOCK_PX,
+        "blockysize": BLOCK_PX, "compress": "deflate", "zlevel": 1, "sparse_ok": True, "bigtiff": "if_safer",
+        "crs": CRS.from_wkt(place.wkt) if place.wkt else None,
+        "transform": from_origin(grid.left, grid.top, grid.resolution, grid.resolution),
+    }  # fmt: skip
+    form |= {"count": 1, "dtype": "float32", "nodata": HOLE} if heights else {"count": 4, "dtype": "uint8"}
+    with replace_atomically(target) as draft:
+        plain = draft.with_suffix(".tiles")
+        try:
+            with rasterio.open(plain, "w", **form) as file:
+                if heights:
+                    file.units = (place.height_unit,)
+                else:
+                    file.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
+                for tile in tiles:
+                    window = Window(tile.column, tile.row, tile.heights.shape[1], tile.heights.shape[0])
+                    bands = np.nan_to_num(tile.heights, nan=HOLE)[None] if heights else np.moveaxis(tile.colors, 2, 0)
+                    file.write(bands, window=window)
+            rasterio.shutil.copy(
+                plain, draft, driver="COG", compress="deflate", predictor="yes", blocksize=BLOCK_PX,
+                overview_resampling="average", bigtiff="if_safer", sparse_ok="true",
+            )  # fmt: skip
+        finally:
+            plain.unlink(missing_ok=True)
