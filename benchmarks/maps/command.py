@@ -81,7 +81,7 @@ def _compare(out: Path, scene: object, args: argparse.Namespace) -> Row:
         window = from_bounds(*box, photo.transform).round_offsets().round_lengths()
         colors = photo.read(window=window, boundless=True)
         heights = dsm.read(1, window=window, boundless=True, fill_value=dsm.nodata).astype(np.float64)
-        left, top = photo.transform @ (window.col_off, window.row_off)
+        left, top = photo.transform.c + pixel * window.col_off, photo.transform.f - pixel * window.row_off
         heights[heights == dsm.nodata] = np.nan
     begun = time.monotonic()
     truth = true_map(prepare(scene), left, top, pixel, heights.shape)  # type: ignore[arg-type]

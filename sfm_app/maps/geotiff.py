@@ -45,7 +45,7 @@ def write_cog(tiles: Iterable[Tile], place: Georeference, target: Path, *, heigh
     import rasterio.shutil
     from rasterio.crs import CRS
     from rasterio.enums import ColorInterp
-    from rasterio.transform import from_origin
+    from rasterio.transform import Affine
     from rasterio.windows import Window
 
     grid = place.grid
@@ -53,7 +53,7 @@ def write_cog(tiles: Iterable[Tile], place: Georeference, target: Path, *, heigh
         "driver": "GTiff", "width": grid.width, "height": grid.height, "tiled": True, "blockxsize": BLOCK_PX,
         "blockysize": BLOCK_PX, "compress": "deflate", "zlevel": 1, "sparse_ok": True, "bigtiff": "if_safer",
         "crs": CRS.from_wkt(place.wkt) if place.wkt else None,
-        "transform": from_origin(grid.left, grid.top, grid.resolution, grid.resolution),
+        "transform": Affine(grid.resolution, 0.0, grid.left, 0.0, -grid.resolution, grid.top),
     }  # fmt: skip
     form |= {"count": 1, "dtype": "float32", "nodata": HOLE} if heights else {"count": 4, "dtype": "uint8"}
     with replace_atomically(target) as draft:
