@@ -3,11 +3,12 @@
     python -m benchmarks.maps --cache CACHE
     python -m benchmarks.maps --cache CACHE --by gps gcp none --side 60 --pictures FOLDER
 
-The photos have positions with 5 cm of noise (gps), eight control points (gcp), or nothing; without either, the raster
-lies nowhere, and only its size, time and memory are told.
+The photos have positions with 5 cm of noise (gps), eight control points (gcp), or nothing: then the raster lies nowhere,
+and only the error of the up direction counts.
 """
 
 import argparse
+import json
 import os
 import sys
 import time
@@ -21,19 +22,22 @@ from benchmarks.common.processes import module_command, run_command
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.maps.land import flight, land, write_control_points, write_positions
 from benchmarks.maps.truth import ORIGIN, edge_errors, height_errors, true_map
+from sfm_app.colmap.model import posed_images, read_model
 from sfm_app.settings import QUALITY_PRESETS
-from sfm_app.synthetic.cameras import make_camera
+from sfm_app.synthetic.cameras import Views, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
 from sfm_app.synthetic.render import prepare
+from sfm_app.synthetic.shapes import SyntheticScene
 
 ABOUT = (
-    "All errors in pixels of the raster. Edges: how far visible edges of the orthophoto are off across their direction, "
+    "All errors in pixels of the raster. Edges: how far visible edges of the orthophoto are off across themselves, "
     "on the ground and at roofs (steps of a meter); found: edges that look alike. Heights: share of the DSM within 1.5 "
-    "pixels, median, 90 % of the sizes, and the bending of the whole (dome). Inside the square of the flight."
+    "pixels, median, 90 % of the sizes, and the bending of the whole (dome). Inside the square of the flight. Up: what it "
+    "comes from, and its error in degrees in the model; control points then level the raster."
 )
 COLUMNS = (
     "by", "photos", "pixel cm", "found %", "edges median", "edges 90 %", "roofs median", "roofs 90 %", "covered %",
-    "within 1.5 px %", "height median", "height |90 %|", "dome", "CPU s of the maps", "MB", "failed",
+    "within 1.5 px %", "height median", "height |90 %|", "dome", "up", "up deg", "CPU s of the maps", "failed",
 )  # fmt: skip
 NOISE_M = 0.05
 HEIGHT_M = 30.0
@@ -49,9 +53,15 @@ def measure(by: str, args: argparse.Namespace) -> Row:
     write_positions(place / "geo.txt", views, NOISE_M, args.seed)
     write_control_points(place / "gcp_list.txt", scene, views, args.side, args.seed)
     out = place / f"{by}-{args.quality}"
-    evidence = {"gps": ["--positions", f"{place / 'geo.txt'}"], "gcp": ["--gcp", f"{place / 'gcp_list.txt'}"], "none": []}
+    evidence = {
+        "gps": ["--positions", f"{place / 'geo.txt'}"],
+        "gcp": ["--gcp", f"{place / 'gcp_list.txt'}"],
+        "none": [],
+    }
     code, said = run_command(
-        module_command("sfm_app", "run", f"{place / 'photos'}", "-o", f"{out}", "--quality", args.quality, *evidence[by])
+        module_command(
+            "sfm_app", "run", f"{place / 'photos'}", "-o", f"{out}", "--quality", args.quality, *evidence[by]
+        )
     )
     row: Row = {"method": "sfm-app", "by": by, "photos": len(views.cam_from_world)}
     if code != 0:
@@ -63,7 +73,18 @@ def measure(by: str, args: argparse.Namespace) -> Row:
         if code != 0:
             return row | {"failed": said}
     row["CPU s of the maps"] = _spent() - begun
+    row |= _up_error(out, views)
     return row if by == "none" else row | _compare(out, scene, args)
+
+
+def _up_error(out: Path, views: Views) -> Row:
+    """Return the method of the up direction, and its error."""
+    found = {image.name: image.cam_from_world().rotation.matrix() for image in posed_images(read_model(out / "sparse"))}
+    ups = np.array([views.cam_from_world[name][:, :3].T @ R @ [0.0, 1.0, 0.0] for name, R in found.items()])
+    up = ups.mean(axis=0)
+    counts = json.loads((out / "manifest.json").read_text(encoding="utf-8"))["stages"]["scene"]["counts"]
+    error = float(np.degrees(np.arctan2(np.hypot(up[0], up[2]), up[1])))
+    return {"up": counts["orientation"]["up"], "up deg": error}
 
 
 def _spent() -> float:
@@ -71,7 +92,7 @@ def _spent() -> float:
     return os.times().children_user + os.times().children_system
 
 
-def _compare(out: Path, scene: object, args: argparse.Namespace) -> Row:
+def _compare(out: Path, scene: SyntheticScene, args: argparse.Namespace) -> Row:
     import rasterio
     from rasterio.windows import from_bounds
 
@@ -84,14 +105,14 @@ def _compare(out: Path, scene: object, args: argparse.Namespace) -> Row:
         left, top = photo.transform.c + pixel * window.col_off, photo.transform.f - pixel * window.row_off
         heights[heights == dsm.nodata] = np.nan
     begun = time.monotonic()
-    truth = true_map(prepare(scene), left, top, pixel, heights.shape)  # type: ignore[arg-type]
+    truth = true_map(prepare(scene), left, top, pixel, heights.shape)
     gray = cv2.cvtColor(np.moveaxis(colors[:3], 0, 2), cv2.COLOR_RGB2GRAY).astype(np.float32)
     if args.pictures:
         args.pictures.mkdir(parents=True, exist_ok=True)
         for name, image in (("ours", gray), ("truth", truth.gray)):
-            cv2.imwrite(str(args.pictures / f"{out.name}-{name}.png"), image)
+            cv2.imwrite(str(args.pictures / f"{out.name}-{name}.png"), image.astype(np.uint8))
         error = np.clip(128.0 + 20.0 * (heights - truth.heights) / pixel, 0.0, 255.0)
-        cv2.imwrite(str(args.pictures / f"{out.name}-heights.png"), np.nan_to_num(error))
+        cv2.imwrite(str(args.pictures / f"{out.name}-heights.png"), np.nan_to_num(error).astype(np.uint8))
     print(f"truth rendered in {time.monotonic() - begun:.0f} s", file=sys.stderr)
     figures = edge_errors(gray, colors[3] > 0, truth) | height_errors(heights, truth, pixel)
     return {"pixel cm": 100.0 * pixel} | figures

@@ -1,6 +1,5 @@
 """Fields on hills with houses and trees, and a drone that photographs them from above."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +56,7 @@ def land(side: float, seed: int) -> SyntheticScene:
 
 def _ground(x: FloatArray, z: FloatArray) -> Shape:
     """Return a field; its normals are those of the hills, so that shades continue across its borders."""
-    points, faces = grid(np.linspace(*z, 40), np.linspace(*x, 40))
+    points, faces = grid(np.linspace(z[0], z[1], 40), np.linspace(x[0], x[1], 40))
     u, v, step = points[:, 1], points[:, 0], 1e-4
     slopes = (hills(u + step, v) - hills(u, v)) / step, (hills(u, v + step) - hills(u, v)) / step
     normals = np.column_stack([-slopes[0], np.ones(len(u)), -slopes[1]])
@@ -138,7 +137,7 @@ def write_control_points(file: Path, scene: SyntheticScene, views: Views, side: 
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def on_map(points: FloatArray | Sequence[FloatArray]) -> FloatArray:
+def on_map(points: FloatArray) -> FloatArray:
     """Return points (N, 3) of the scene as east, north and height on the map."""
-    x, y, z = np.asarray(points).T
-    return np.column_stack([x, -z, y]) + ORIGIN
+    x, y, z = points.T
+    return np.asarray(np.column_stack([x, -z, y]) + ORIGIN)

@@ -82,7 +82,10 @@ def edge_errors(gray: NDArray[np.float32], covered: BoolArray, truth: TrueMap, s
     dx, dy = (cv2.Sobel(truth.gray, cv2.CV_64F, *order)[rows, columns] for order in ((1, 0), (0, 1)))
     length = np.maximum(np.hypot(dx, dy), 1e-9)
     along = np.arange(-REACH_PX - MOST_SHIFT_PX, REACH_PX + MOST_SHIFT_PX + 1e-6, STEP_PX)
-    x, y = columns[:, None] + dx[:, None] / length[:, None] * along, rows[:, None] + dy[:, None] / length[:, None] * along
+    x, y = (
+        columns[:, None] + dx[:, None] / length[:, None] * along,
+        rows[:, None] + dy[:, None] / length[:, None] * along,
+    )
     ours, true = (_profiles(image, x, y) for image in (gray, truth.gray))
     shifts, alike = _shifts(ours, true)
     highest = cv2.dilate(truth.heights, np.ones((2 * NEAR_PX + 1,) * 2))

@@ -282,7 +282,9 @@ class ExportCommand(click.Command):
     help="File or folder to write.  [default: OUT/model.FORMAT, OUT/cameras.json, OUT/export/FORMAT, ...]",
 )
 @click.option("--points", is_flag=True, help="Export the sparse points and the cameras instead of the model.")
-@click.option("--resolution", default="", metavar="LENGTH", help="Pixel of a map, such as 2cm.  [default: as the photos]")
+@click.option(
+    "--resolution", default="", metavar="LENGTH", help="Pixel of a map, such as 2cm.  [default: as the photos]"
+)
 @click.option(
     "--plane",
     default="",

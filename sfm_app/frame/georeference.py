@@ -66,7 +66,8 @@ def georeference(
 
     GPS errs by 3 to 10 m horizontally and twice that in height. So up stays as given, and only horizontal positions
     are used: w = a z + b in complex numbers, by RANSAC over pairs, then least squares. An unsure up is replaced by that
-    of the positions if they determine it well, a sure one if it leaves residuals that theirs does not. Centers (N, 3) and `up` (3,) are in the frame of the reconstruction.
+    of the positions if they determine it well; a sure one, if it leaves residuals that theirs does not. Centers (N, 3)
+    and `up` (3,) are in the frame of the reconstruction.
     """
     cameras = centers[[position is not None for position in positions]]
     given = [position for position in positions if position is not None]

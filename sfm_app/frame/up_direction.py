@@ -48,7 +48,7 @@ class OPTIONS:
     """Least number of photos of a flight. Chosen by hand: two lines of three."""
     flight_deg: float = 15.0
     """Largest angle of four of five optical axes of a flight to their mean, and of this to the normal of the cameras'
-    plane. Chosen by hand: gimbals and wind err by a few degrees; 11 of 13 real sets that people took have more than 15."""
+    plane. Chosen by hand: gimbals and wind err by a few degrees; of 13 sets that people took, 3 have less than 15."""
     flight_share: float = 0.15
     """Least deviation of the cameras across the flight, as a share of their height. Chosen by hand: two lines with 70 %
     overlap have 0.16; people at a wall vary their height by 0.1 of their distance."""
@@ -203,7 +203,7 @@ def odds(nats: float) -> float:
 def up_direction(
     rotations: FloatArray, centers: FloatArray, scenery: Scenery, segments: Segments, turn_deg: int | None = None
 ) -> UpEstimate:
-    """Find up from a flight, from vertical lines near that of the cameras' roll, or else from the ground or the roll."""
+    """Find up from a flight, vertical lines near that of the cameras' roll, or else from the ground or the roll."""
     rolls = up_cues.roll_hypotheses(rotations, centers)
     if turn_deg is None:
         upright = select_roll(rolls, rotations, centers, scenery)
@@ -233,9 +233,7 @@ def up_direction(
     return upright
 
 
-def flight_direction(
-    rotations: FloatArray, centers: FloatArray, points: FloatArray
-) -> tuple[FloatArray, float] | None:
+def flight_direction(rotations: FloatArray, centers: FloatArray, points: FloatArray) -> tuple[FloatArray, float] | None:
     """Return up (3,) and its deviation in degrees if photos were taken from above, in several lines; else None.
 
     Their axes are parallel, and their centers lie in a plane across these. People who photograph a wall stand on one

@@ -131,7 +131,9 @@ def _describe(product: str, shown: Projection, resolution: float, scale: float) 
     if not unit:
         text += "; the size is unknown: `sfm-app run` with --gcp, --markers or --scale gives it"
     if scale < 1.0:
-        text += f"; the photos are {1.0 / scale:.2g} times as fine: `sfm-app run` with --set texture.max_pages=64 keeps all"
+        text += (
+            f"; the photos are {1.0 / scale:.2g} times as fine: `sfm-app run` with --set texture.max_pages=64 keeps all"
+        )
     return text
 
 

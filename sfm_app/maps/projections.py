@@ -25,11 +25,11 @@ class OPTIONS:
     """Constants of planes."""
 
     flat_deg: float = 10.0
-    """Largest slope of a plane whose picture has `NORTH` at its top: the direction of its slope would be noise."""
+    """Largest slope of a plane whose picture has `NORTH` at its top. Chosen by hand: people pick floors so well."""
     upright_deg: float = 20.0
-    """Largest angle of the faces of a wall to the vertical. Chosen by hand: reliefs and reveals of windows lie beyond."""
+    """Largest angle of the faces of a wall to the vertical. Chosen by hand: reliefs and sills lie beyond."""
     bin_deg: float = 1.0
-    """Step of the directions of walls."""
+    """Step of the directions of walls. Chosen by hand: a fifth of their scatter."""
     spread_deg: float = 5.0
     """Standard deviation with which directions count together. Chosen by hand: walls of masonry scatter as much."""
     turn_deg: float = 30.0
@@ -81,7 +81,7 @@ def _in_axes(points: FloatArray, frame: MetricFrame, name: str, cut: bool = Fals
 
 
 def read_plane(text: str) -> list[FloatArray]:
-    """Return two or three points (3,) of text such as "0,0,0 1,0,0 0,1,0", none for `FACADE`; ConfigError for others."""
+    """Return two or three points (3,) of a text, none for `FACADE`; ConfigError for others."""
     if text == FACADE:
         return []
     try:

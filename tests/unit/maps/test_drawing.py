@@ -78,7 +78,7 @@ def test_backs_show_what_lies_behind_them(house):
 
 
 def test_texels_are_measured_where_most_of_the_picture_is(house):
-    corners, page, pages = plan(house)
+    corners, page, _ = plan(house)
     assert texel_size(corners, page, house.texture) == pytest.approx(2.0 * HALF / PAGE)
     narrow = corners.copy()
     narrow[page == 1, :, 3:] = 0.5  # a roof without a photo has one color
