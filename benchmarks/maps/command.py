@@ -3,8 +3,8 @@
     python -m benchmarks.maps --cache CACHE
     python -m benchmarks.maps --cache CACHE --by gps gcp none --side 60 --pictures FOLDER
 
-The photos have positions with 5 cm of noise (gps), eight control points (gcp), or nothing: then the raster lies nowhere,
-and only the error of the up direction counts.
+The photos have positions with 5 cm of noise (gps), eight control points (gcp), or nothing: then only the error of the up
+direction counts.
 """
 
 import argparse
@@ -32,8 +32,8 @@ from sfm_app.synthetic.shapes import SyntheticScene
 ABOUT = (
     "All errors in pixels of the raster. Edges: how far visible edges of the orthophoto are off across themselves, "
     "on the ground and at roofs (steps of a meter); found: edges that look alike. Heights: share of the DSM within 1.5 "
-    "pixels, median, 90 % of the sizes, and the bending of the whole (dome). Inside the square of the flight. Up: what it "
-    "comes from, and its error in degrees in the model; control points then level the raster."
+    "pixels, median, 90 % of the sizes, and the bending of the whole (dome). Inside the square of the flight. Up: its "
+    "source, and its error in degrees in the model; control points then level the raster."
 )
 COLUMNS = (
     "by", "photos", "pixel cm", "found %", "edges median", "edges 90 %", "roofs median", "roofs 90 %", "covered %",

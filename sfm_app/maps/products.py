@@ -70,7 +70,7 @@ def export_map(
     if options.plane:
         read_plane(options.plane)  # fail before files are read
     name = f"{product}-plane.tif" if options.plane else f"{product}.tif"
-    place = Path(out) if target is None else Path(target)
+    place = Path(out) / name if target is None else Path(target)
     place = place / name if place.is_dir() else place
     if place.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{place.name} does not end in .tif", hint=f"name it {place.stem}.tif")

@@ -29,8 +29,8 @@ class OPTIONS:
     upright_deg: float = 20.0
     """Largest angle of the faces of a wall to the vertical. Chosen by hand: reliefs and sills lie beyond."""
     bin_deg: float = 1.0
-    """Step of the directions of walls. Chosen by hand: a fifth of their scatter."""
-    spread_deg: float = 5.0
+    """Step of the directions of walls. Chosen by hand: a tenth of their scatter."""
+    spread_deg: float = 10.0
     """Standard deviation with which directions count together. Chosen by hand: walls of masonry scatter as much."""
     turn_deg: float = 30.0
     """Largest angle of faces to the direction of their wall. Chosen by hand."""

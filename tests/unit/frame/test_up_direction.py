@@ -196,8 +196,11 @@ def test_no_points_one_place_and_a_line_have_no_plane(points):
     assert dominant_plane(points, np.array([0.0, 1.0, 0.0]), (0.0, 20.0)) is None
 
 
-def survey(down, *, lines=3, photos=7, one_way=False, lean_deg=2.0, apart=0.4, seed=0):
-    """Photos on a grid, 1 away from a rough plane that lies along `down`; photos of every second line are turned."""
+def survey(down, *, lines=3, photos=7, one_way=False, lean_deg=2.0, apart=0.4, ahead=0.0, seed=0):
+    """Photos on a grid, 1 away from a rough plane that lies along `down`; photos of every second line are turned.
+
+    Lines are `apart` from each other, and `ahead` of each other along the view.
+    """
     rng = np.random.default_rng(seed)
     turned = Rotation.random(random_state=seed + 9).as_matrix()
     right = np.array([1.0, 0.0, 0.0])
@@ -208,7 +211,7 @@ def survey(down, *, lines=3, photos=7, one_way=False, lean_deg=2.0, apart=0.4, s
             back = 180.0 if line % 2 and not one_way else 0.0
             lean = Rotation.from_euler("xyz", [*rng.normal(scale=lean_deg, size=2), back + rng.normal(scale=2.0)], True)
             rotations.append(lean.as_matrix() @ level @ turned.T)
-            place = np.array([apart * line, 0.2 * k, 0.0]) + rng.normal(scale=[0.02, 0.02, 0.01], size=3)
+            place = np.array([apart * line, 0.2 * k, ahead * line]) + rng.normal(scale=[0.02, 0.02, 0.01], size=3)
             centers.append(turned @ (level.T @ place))
     points = rng.uniform([-0.5, -0.5, 0.9], [1.5, 2.0, 1.05], (400, 3)) @ level @ turned.T
     return np.array(rotations), np.array(centers), points, turned
@@ -235,7 +238,8 @@ def test_what_is_no_flight():
     assert flight_direction(*survey(DOWN, lean_deg=25.0)[:3]) is None  # views of a thing from all sides
     assert flight_direction(*survey(DOWN, lines=1, photos=12)[:3]) is None  # a walk along a wall
     assert flight_direction(*survey(DOWN, lines=2, apart=0.1)[:3]) is None  # with the camera held high and low
+    assert flight_direction(*survey(DOWN, apart=0.0, ahead=-0.4)[:3]) is None  # a crowd on a square
     assert flight_direction(rotations[:5], centers[:5], points) is None
     assert flight_direction(rotations, centers, centers - (points - centers.mean(axis=0))[: len(centers)]) is None
-    mixed = centers + 0.4 * np.random.default_rng(0).normal(size=(21, 1)) * rotations[:, 2]  # near and far
+    mixed = centers + 0.2 * np.random.default_rng(0).normal(size=(21, 1)) * rotations[:, 2]  # near and far
     assert flight_direction(rotations, mixed, points) is None

@@ -6,6 +6,7 @@ import pytest
 from sfm_app.errors import InputError
 from sfm_app.maps import drawing
 from sfm_app.maps.drawing import cover, cut_front, draw_tiles, facing_corners, rays_per_pixel, texel_size
+from sfm_app.synthetic.shapes import grid
 from tests.unit.maps.conftest import HALF, PAGE
 
 
@@ -35,6 +36,23 @@ def test_tiles_do_not_change_the_picture(house, monkeypatch):
     assert whole[2] == 1 and parts[2] == 16
     assert np.abs(whole[0].astype(int) - parts[0]).max() <= 1  # rounding
     np.testing.assert_allclose(parts[1], whole[1], atol=1e-6)
+
+
+def test_small_triangles_at_borders_of_tiles_belong_to_both(monkeypatch):
+    """A slope of triangles of a third of a pixel: heights are linear everywhere, with one sample and with three."""
+    steps = np.arange(0.0, 12.01, 1.0 / 3.0)
+    flat, faces = grid(steps, steps)
+    points = np.column_stack([flat, 2.0 * flat[:, 0] - flat[:, 1] + 50.0])
+    corners = np.concatenate([points[faces], np.zeros((len(faces), 3, 2))], axis=2)
+    if area(corners)[0] < 0.0:
+        corners = corners[:, ::-1]
+    x, y = np.meshgrid(np.arange(12) + 0.5, 11.5 - np.arange(12))
+    for rays in (1, 3):
+        monkeypatch.setattr(drawing, "FINE_PX", 5 * rays)
+        whole = np.full((12, 12), np.nan)
+        for tile in draw_tiles(corners, np.zeros(len(faces), np.int32), (), cover(corners, 1.0), rays):
+            whole[tile.row : tile.row + 5, tile.column : tile.column + 5] = tile.heights
+        np.testing.assert_allclose(whole, 2.0 * x - y + 50.0, atol=1e-4)
 
 
 def test_tiles_without_triangles_are_not_drawn(house):
@@ -80,6 +98,9 @@ def test_backs_show_what_lies_behind_them(house):
 def test_texels_are_measured_where_most_of_the_picture_is(house):
     corners, page, _ = plan(house)
     assert texel_size(corners, page, house.texture) == pytest.approx(2.0 * HALF / PAGE)
+    finer = corners.copy()
+    finer[page == 1, :, 3:] *= 8.0
+    assert texel_size(finer, page, house.texture) == pytest.approx(2.0 * HALF / PAGE)
     narrow = corners.copy()
     narrow[page == 1, :, 3:] = 0.5  # a roof without a photo has one color
     assert texel_size(narrow, page, house.texture) == pytest.approx(2.0 * HALF / PAGE)

@@ -63,6 +63,10 @@ def test_an_orthophoto_lies_on_the_map(make_run, heading_deg):
     assert np.abs(green - gray_of(z))[inside & sure].max() < 1.1
     edge = inside & (np.abs(house) < 0.3 * 0.05)
     assert not heading_deg or 0.2 < ((blue[edge] - ROOF) / (GROUND - ROOF)).mean() < 0.8  # pixels on an edge are mixed
+    border = (opacity > 0) & (opacity < 255)
+    assert not heading_deg or border.sum() > 100
+    assert opacity.sum() / 255.0 * 0.05**2 == pytest.approx((2.0 * HALF) ** 2, rel=0.001)
+    assert {one.suffix for one in path.parent.iterdir() if "orthophoto" in one.name} == {".tif"}
     with rasterio.open(path) as file:
         assert file.crs.to_epsg() == 32632 and file.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
         assert file.res == pytest.approx((0.05, 0.05), abs=1e-12) and file.colorinterp[3].name == "alpha"
@@ -182,7 +186,7 @@ def test_sheets_are_to_scale(make_run):
     dots = 8.0 / 50.0 / 0.0254 * page.info["dpi"][0]
     colored = np.flatnonzero((np.asarray(page).astype(int).std(axis=2) > 20).any(axis=0))
     assert colored[-1] - colored[0] == pytest.approx(dots, rel=0.02)
-    assert pdf.read_bytes().startswith(b"%PDF")
+    assert pdf.read_bytes().startswith(b"%PDF") and b"Date" not in pdf.read_bytes()
 
 
 def test_same_run_same_bytes(make_run):
@@ -218,6 +222,13 @@ def test_bad_commands(make_run, arguments, says, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(main, ["export", str(make_run(METERS)), *arguments])
     assert result.exit_code == 2 and says in result.output and "hint:" in result.output
+
+
+def test_a_bad_plane_is_named_before_files_are_read(tmp_path):
+    with pytest.raises(ConfigError, match="no point"):
+        export_map(tmp_path / "none", "dsm", options=MapOptions("", "left wall"))
+    with pytest.raises(InputError):
+        export_map(tmp_path / "none", "dsm", options=MapOptions("", "facade"))
 
 
 def test_a_typing_error_of_the_resolution_is_an_error_and_leaves_no_file(make_run):

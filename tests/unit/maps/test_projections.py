@@ -91,6 +91,12 @@ def test_the_main_wall_among_others(direction_deg):
     assert point @ true == pytest.approx(3.0, abs=0.01)
 
 
+def test_a_rough_wall_counts_more_than_a_smooth_one_of_half_its_size():
+    rough, smooth = wall(10.0, 10.0, 6.0, 3.0, noise=0.03), wall(70.0, 5.0, 6.0, 1.0)
+    normal, _ = find_facade(surface(rough, smooth))
+    assert np.degrees(np.arctan2(normal[0], normal[2])) == pytest.approx(10.0, abs=0.3)
+
+
 def test_one_wall_of_two_triangles_and_a_leaning_one():
     normal, point = find_facade(surface(wall(30.0, 2.0, 2.0, 1.0)[:1], wall(30.0, 2.0, 2.0, 1.0)[-1:]))
     assert normal == pytest.approx([0.5, 0.0, np.sqrt(0.75)], abs=1e-9)
