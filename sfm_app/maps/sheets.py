@@ -53,7 +53,7 @@ def write_sheet(raster: Path, caption: Caption) -> tuple[Path, Path]:
     legend = ""
     if len(bands) == 1:
         picture, (low, high) = shade(bands[0].astype(np.float32).filled(np.nan), pixel)
-        legend = f"relief from {_length(low, caption.unit_m)} (dark) to {_length(high, caption.unit_m)} (bright)"
+        legend = f"heights from {_length(low, caption.unit_m)} (dark) to {_length(high, caption.unit_m)} (bright)"
     else:
         opacity = bands[3:].astype(np.float64) / 255.0
         picture = np.moveaxis(np.round(255.0 + (bands[:3] - 255.0) * opacity).astype(np.uint8), 0, 2)
@@ -92,14 +92,14 @@ def compose(picture: ByteArray, pixel: float, caption: Caption, legend: str) -> 
     if enlarge > 1:
         image = image.resize((width * enlarge, height * enlarge), Image.Resampling.BICUBIC)
     margin, line = (max(round(length / INCH_M * dpi), 1) for length in (MARGIN_M, LINE_M))
-    below = 2 * line if not legend else 4 * line
     font = ImageFont.load_default(line)
     bar = _bar_length(BAR_SHARE * image.width * pixel)
     texts = [f"{caption.product}, {caption.title}, pixels of {_length(pixel * enlarge, caption.unit_m)}"]
-    texts += [legend] if legend else []
     texts[0] += f", 1 : {scale} on this page" if scale else ", size unknown"
+    texts += [legend] if legend else []
     room = max(image.width, *(ceil(font.getlength(text)) for text in texts))
-    page = Image.new("RGB", (room + 2 * margin, image.height + 2 * margin + 3 * line + below), "white")
+    rows = [(3 + 3 * number) * line // 2 for number in range(len(texts))]
+    page = Image.new("RGB", (room + 2 * margin, image.height + 2 * margin + 3 * line + rows[-1]), "white")
     page.paste(image, (margin, margin))
     pen, top = ImageDraw.Draw(page), margin + image.height + line
     for part in range(BAR_PARTS):
@@ -108,8 +108,8 @@ def compose(picture: ByteArray, pixel: float, caption: Caption, legend: str) -> 
         pen.rectangle((left, top, right, top + line // 2), fill=fill, outline="black")
     end = margin + round(bar / pixel) + line
     pen.text((end, top + line // 4), _length(bar, caption.unit_m), fill="black", font=font, anchor="lm")
-    for number, text in enumerate(texts):
-        pen.text((margin, top + (1 + 2 * number) * line), text, fill="black", font=font)
+    for row, text in zip(rows, texts, strict=True):
+        pen.text((margin, top + row), text, fill="black", font=font)
     return page, dpi
 
 
