@@ -36,8 +36,9 @@ ABOUT = (
     "source, and its error in degrees in the model; control points then level the raster."
 )
 COLUMNS = (
-    "by", "seed", "photos", "pixel cm", "found %", "edges median", "edges 90 %", "roofs median", "roofs 90 %", "covered %",
-    "within 1.5 px %", "height median", "height |90 %|", "dome", "up", "up deg", "CPU s of the maps", "failed",
+    "by", "seed", "photos", "pixel cm", "found %", "edges median", "edges 90 %", "roofs median", "roofs 90 %",
+    "covered %", "within 1.5 px %", "height median", "height |90 %|", "dome", "up", "up deg", "CPU s of the maps",
+    "failed",
 )  # fmt: skip
 NOISE_M = 0.05
 HEIGHT_M = 30.0

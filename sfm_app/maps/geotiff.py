@@ -43,6 +43,7 @@ def write_cog(tiles: Iterable[Tile], place: Georeference, target: Path, *, heigh
     """
     import rasterio
     import rasterio.shutil
+    from rasterio._err import CPLE_BaseError  # raised, and exported nowhere
     from rasterio.crs import CRS
     from rasterio.enums import ColorInterp
     from rasterio.transform import Affine
@@ -72,5 +73,7 @@ def write_cog(tiles: Iterable[Tile], place: Georeference, target: Path, *, heigh
                 plain, draft, driver="COG", compress="deflate", predictor="yes", blocksize=BLOCK_PX,
                 overview_resampling="average", bigtiff="if_safer", sparse_ok="true",
             )  # fmt: skip
+        except CPLE_BaseError as err:  # closing a file on a full disk has no errors: the copy does
+            raise OSError(str(err)) from err
         finally:
             plain.unlink(missing_ok=True)

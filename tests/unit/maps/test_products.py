@@ -1,5 +1,6 @@
 """Files of finished runs, read by GDAL, against formulas."""
 
+import subprocess
 import sys
 
 import numpy as np
@@ -244,6 +245,40 @@ def test_what_cannot_be_written_names_the_target(make_run, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"cannot write .*map\.tif"):
         export_map(make_run(METERS), "dsm", tmp_path / "file" / "map.tif")
+
+
+FULL_DISK = """
+import resource, signal, sys
+from pathlib import Path
+from sfm_app.errors import InputError
+from sfm_app.maps.products import MapOptions, export_map
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+out, whole = Path(sys.argv[1]), Path(sys.argv[2]).read_bytes()
+for size in range(500, 8 * len(whole), len(whole) // 10):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+    try:
+        (path,) = export_map(out, "orthophoto", out / "small.tif", MapOptions("10cm"))
+    except InputError as err:
+        assert "small.tif" in str(err) and not (out / "small.tif").exists(), err
+        print("refused")
+    else:
+        assert path.read_bytes() == whole
+        path.unlink()
+        print("whole")
+    assert not [one for one in out.iterdir() if "small" in one.name]
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limits on files")
+def test_a_full_disk_gives_an_error_or_the_whole_file(make_run):
+    out = make_run(METERS)
+    (whole,) = export_map(out, "orthophoto", options=MapOptions("10cm"))
+    command = [sys.executable, "-c", FULL_DISK, str(out), str(whole)]
+    said = subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
+    assert said.returncode == 0, said.stderr
+    results = said.stdout.split()
+    assert results == sorted(results) and set(results) == {"refused", "whole"}
 
 
 def test_without_rasterio_it_says_what_to_install(make_run, monkeypatch):
