@@ -1,7 +1,6 @@
 """Cloud Optimized GeoTIFF by GDAL, tile by tile."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,17 +16,6 @@ BLOCK_PX = 512
 """Side of the blocks of a file, as GDAL's driver has it by default."""
 
 
-@dataclass(frozen=True, slots=True)
-class Georeference:
-    """Where a raster lies."""
-
-    grid: Grid
-    wkt: str
-    """Coordinate system; empty if the size is unknown."""
-    height_unit: str = ""
-    """Unit of heights: "m", "ft" or empty."""
-
-
 def check_rasterio() -> None:
     """Raise a ConfigError if rasterio, which brings GDAL, is missing or broken."""
     try:
@@ -36,10 +24,11 @@ def check_rasterio() -> None:
         raise ConfigError(f"orthophotos and elevation models need rasterio: {err}", hint=INSTALL_HINT) from None
 
 
-def write_cog(tiles: Iterable[Tile], place: Georeference, target: Path, *, heights: bool) -> None:
-    """Write colors with opacity, or heights, as a Cloud Optimized GeoTIFF; OSError if it cannot be written.
+def write_cog(tiles: Iterable[Tile], grid: Grid, wkt: str, target: Path, heights_in: str | None = None) -> None:
+    """Write colors with opacity as a Cloud Optimized GeoTIFF, or heights in a unit; OSError if it cannot be written.
 
-    The same tiles give the same bytes. The tiles go to a plain file first, because the overviews precede the pixels.
+    `wkt` is the coordinate system, `heights_in` "m" or "ft"; both are empty where unknown. The same tiles give the same
+    bytes. The tiles go to a plain file first, because the overviews precede the pixels.
     """
     import rasterio
     import rasterio.shutil
@@ -49,11 +38,11 @@ def write_cog(tiles: Iterable[Tile], place: Georeference, target: Path, *, heigh
     from rasterio.transform import Affine
     from rasterio.windows import Window
 
-    grid = place.grid
+    heights = heights_in is not None
     form = {
         "driver": "GTiff", "width": grid.width, "height": grid.height, "tiled": True, "blockxsize": BLOCK_PX,
         "blockysize": BLOCK_PX, "compress": "deflate", "zlevel": 1, "sparse_ok": True, "bigtiff": "if_safer",
-        "crs": CRS.from_wkt(place.wkt) if place.wkt else None,
+        "crs": CRS.from_wkt(wkt) if wkt else None,
         "transform": Affine(grid.resolution, 0.0, grid.left, 0.0, -grid.resolution, grid.top),
     }  # fmt: skip
     form |= {"count": 1, "dtype": "float32", "nodata": HOLE} if heights else {"count": 4, "dtype": "uint8"}
@@ -62,7 +51,7 @@ def write_cog(tiles: Iterable[Tile], place: Georeference, target: Path, *, heigh
         try:
             with rasterio.open(plain, "w", **form) as file:
                 if heights:
-                    file.units = (place.height_unit,)
+                    file.units = (heights_in,)
                 else:
                     file.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
                 for tile in tiles:

@@ -9,7 +9,7 @@ from sfm_app.engine.stage import resume_hint
 from sfm_app.errors import ConfigError, InputError, ReconstructionError
 from sfm_app.exports import naming_target, stored_frame, stored_model
 from sfm_app.maps.drawing import cover, cut_front, draw_tiles, facing_corners, rays_per_pixel, texel_size
-from sfm_app.maps.geotiff import Georeference, check_rasterio, write_cog
+from sfm_app.maps.geotiff import check_rasterio, write_cog
 from sfm_app.maps.projections import Projection, project, read_plane
 from sfm_app.maps.sheets import Caption, write_sheet
 from sfm_app.pipeline import TEXTURE
@@ -95,9 +95,8 @@ def _write(run: RunContext, product: str, target: Path, options: MapOptions) -> 
     tiles = draw_tiles(
         corners, page, () if is_dsm else model.texture.pages, grid, 1 if is_dsm else rays_per_pixel(resolution, texel)
     )
-    georeference = Georeference(grid, shown.wkt, _unit_name(shown.height_m))
     with naming_target(target):
-        write_cog(tiles, georeference, target, heights=is_dsm)
+        write_cog(tiles, grid, shown.wkt, target, _unit_name(shown.height_m) if is_dsm else None)
         if not options.plane:
             return (target,)
         return (target, *write_sheet(target, Caption(product, shown.title, shown.unit_m)))
