@@ -44,6 +44,7 @@ FORMAT_KINDS = ("exporters", "scene_exporters")
 MAPS = {
     "orthophoto": "Cloud Optimized GeoTIFF of the model from above, or from the front of --plane; QGIS",
     "dsm": "the same with heights, or distances from --plane",
+    "contours": "GeoPackage with lines of equal height, which follow houses and trees; QGIS",
 }
 """Formats of `sfm_app.maps`, which loads rasterio."""
 POINT = re.compile(r"[-+]?[\d.]+[^,\s]*,")
@@ -291,10 +292,11 @@ class ExportCommand(click.Command):
     metavar="A B [C]",
     help="Map of a plane, by 3 points x,y,z as in `measure`; 2 points: of a section; `facade`: of the main wall.",
 )
+@click.option("--interval", default="", metavar="LENGTH", help="Step of contours.  [default: twenty or more]")
 @output_options
 def export(  # noqa: PLR0913 - the options of the command
-    out: Path, file_format: str, target: Path | None, points: bool, resolution: str, plane: str, quiet: bool,
-    as_json: bool,
+    out: Path, file_format: str, target: Path | None, points: bool, resolution: str, plane: str, interval: str,
+    quiet: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Write the results of the run in OUT for another program, without recomputing anything."""
     from sfm_app.cli.terminal import Terminal
@@ -302,15 +304,16 @@ def export(  # noqa: PLR0913 - the options of the command
 
     name, methods = choose_format(file_format, target), load_plugins()
     is_map = name in MAPS
-    fits = {"points": name in methods.exporters, "resolution": is_map, "plane": is_map}
-    for option, value in {"points": points, "resolution": resolution, "plane": plane}.items():
+    fits = {"points": name in methods.exporters, "resolution": is_map, "plane": is_map, "interval": name == "contours"}
+    given = {"points": points, "resolution": resolution, "plane": plane, "interval": interval}
+    for option, value in given.items():
         if value and not fits[option]:
             raise ConfigError(f"--{option} does not apply to the format '{name}'", hint="omit it")
     if is_map:
         from sfm_app.maps.products import MapOptions, export_map
 
         with Terminal(quiet=quiet or as_json) as progress:
-            paths = list(export_map(out, name, target, MapOptions(resolution, plane), progress=progress))
+            paths = list(export_map(out, name, target, MapOptions(resolution, plane, interval), progress=progress))
     elif name in methods.scene_exporters:
         with Terminal(quiet=quiet or as_json) as progress:
             paths = [sfm_app.export_scene(out, name, target, progress=progress)]

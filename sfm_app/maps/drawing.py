@@ -124,6 +124,12 @@ def rays_per_pixel(resolution: float, texel: float) -> int:
     return max(RAYS, min(2 * ceil(resolution / texel / 2.0) + 1 if texel > 0.0 else RAYS, FINE_PX))
 
 
+def count_tiles(grid: Grid, rays: int) -> int:
+    """Return the number of tiles, also of those without a triangle."""
+    side = max(FINE_PX // rays, 1)
+    return -(-grid.width // side) * -(-grid.height // side)
+
+
 def draw_tiles(
     corners: FloatArray, page: NDArray[np.int32], pages: Sequence[ByteArray], grid: Grid, rays: int
 ) -> Iterator[Tile]:
