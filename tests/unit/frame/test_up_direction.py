@@ -232,6 +232,14 @@ def test_photos_on_a_grid_that_look_one_way_are_a_map(one_way, seed):
     assert told.method == ROLL  # who knows that it is a wall is believed
 
 
+def test_a_flight_with_a_round_of_oblique_photos():
+    rotations, centers, points, turned = survey(DOWN)
+    leaning = [Rotation.from_euler("x", angle, True).as_matrix() for angle in (35.0, 40.0, 45.0, 38.0)]
+    oblique = np.array([lean @ R for lean, R in zip(leaning * 2, rotations[::3], strict=False)])
+    found = flight_direction(np.concatenate([rotations, oblique]), np.concatenate([centers, centers[::3]]), points)
+    assert found is not None and error_deg(found[0], turned[:, 1]) < 1.0
+
+
 def test_what_is_no_flight():
     rotations, centers, points, _ = survey(DOWN)
     assert flight_direction(rotations, centers, points) is not None
