@@ -15,15 +15,7 @@ import click
 from click.shell_completion import get_completion_class
 
 import sfm_app
-from sfm_app.cli.options import (
-    PATH,
-    complete_methods,
-    json_option,
-    output_options,
-    setting_field,
-    settings_from_flags,
-    settings_options,
-)
+from sfm_app.cli.options import PATH, json_option, output_options, setting_field, settings_from_flags, settings_options
 from sfm_app.cli.output import STAGE_TITLES, file_lines, open_browser, print_json, print_lines, print_text, table
 from sfm_app.errors import ConfigError, SfmError
 from sfm_app.wording import parse_length, parse_point
@@ -272,7 +264,7 @@ class ExportCommand(click.Command):
     "file_format",
     default="",
     metavar="NAME",
-    shell_complete=complete_methods(*FORMAT_KINDS),
+    shell_complete=lambda _ctx, _parameter, start: [name for name in format_summaries() if name.startswith(start)],
     help="One of the formats below.  [default: the suffix of the output file]",
 )
 @click.option(

@@ -94,14 +94,13 @@ def _crossing(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def texel_size(corners: FloatArray, page: NDArray[np.int32], texture: Texture) -> float:
-    """Return the side of a texel on the surface: the median of the visible area, in the raster's unit.
+    """Return the side of a texel in the picture: the median over its area, in the raster's unit.
 
     Texels are the pixels of the photos, unless the pages of the texture are too small for these.
     """
     sizes = np.array([[pixels.shape[1], pixels.shape[0]] for pixels in texture.pages], np.float64)
     texels = np.abs(_turns(corners[:, :, UV] * sizes[page][:, None]))
-    a, b = (corners[:, k, :3] - corners[:, 0, :3] for k in (1, 2))
-    areas = np.linalg.norm(np.cross(a, b), axis=1)
+    areas = _turns(corners[:, :, :2])
     seen = (texels > 0.0) & (areas > 0.0)
     side, weight = np.sqrt(areas[seen] / texels[seen]), areas[seen]
     order = np.argsort(side)
