@@ -71,7 +71,10 @@ def _cast(
 
 
 def edge_errors(gray: NDArray[np.float32], covered: BoolArray, truth: TrueMap, seed: int = 0) -> Row:
-    """Return how far edges of an orthophoto are off across their direction, in pixels: all, and those of roofs."""
+    """Return how far edges of an orthophoto are off across their direction, in pixels: on the ground, and of roofs.
+
+    Moved: of all edges, after the shift that fits best, which is the error of the place.
+    """
     edges = cv2.Canny(truth.gray.astype(np.uint8), *STRONG, L2gradient=True) > 0
     margin = round(REACH_PX + MOST_SHIFT_PX)
     inside = cv2.erode(covered.astype(np.uint8), np.ones((2 * margin + 1,) * 2)) > 0
@@ -92,6 +95,9 @@ def edge_errors(gray: NDArray[np.float32], covered: BoolArray, truth: TrueMap, s
     lowest = cv2.erode(truth.heights, np.ones((2 * NEAR_PX + 1,) * 2))
     roof = (highest - lowest)[rows, columns] > JUMP_M
     figures: Row = {"edges": len(rows), "found %": 100.0 * float(alike.mean())}
+    across = np.column_stack([dx, dy]) / length[:, None]
+    moved = np.linalg.lstsq(across[alike], shifts[alike], rcond=None)[0]
+    figures["edges moved 90 %"] = float(np.quantile(np.abs(shifts - across @ moved)[alike], 0.9))
     for name, own in (("edges", alike & ~roof), ("roofs", alike & roof)):
         sizes = np.abs(shifts[own])
         figures |= {f"{name} median": float(np.median(sizes)), f"{name} 90 %": float(np.quantile(sizes, 0.9))}
@@ -123,7 +129,7 @@ def _shifts(ours: FloatArray, true: FloatArray) -> tuple[FloatArray, BoolArray]:
 
 
 def height_errors(heights: FloatArray, truth: TrueMap, pixel: float) -> Row:
-    """Return how far heights are off, in pixels, and how far the ground bends.
+    """Return how far heights are off, in pixels, also after their median is subtracted, and how far the ground bends.
 
     The dome is the height of the paraboloid that fits the errors below 10 pixels, over the half diagonal.
     """
@@ -137,6 +143,7 @@ def height_errors(heights: FloatArray, truth: TrueMap, pixel: float) -> Row:
     return {
         "covered %": 100.0 * float(both.sum() / there.sum()),
         f"within {TOLERANCE_PX} px %": 100.0 * float((np.abs(error[both]) <= TOLERANCE_PX).mean()),
+        "moved": 100.0 * float((np.abs(error[both] - np.median(error[both])) <= TOLERANCE_PX).mean()),
         "height median": float(np.median(error[both])),
         "height |90 %|": float(np.quantile(np.abs(error[both]), 0.9)),
         "dome": float(dome),
