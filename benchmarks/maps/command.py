@@ -30,16 +30,16 @@ from sfm_app.synthetic.render import prepare
 from sfm_app.synthetic.shapes import SyntheticScene
 
 ABOUT = (
-    "All errors in pixels of the raster, inside the square of the flight. Edges: how far visible edges of the orthophoto "
-    "are off across themselves, on the ground and at roofs (steps of a meter); found: edges that look alike. Heights: "
-    "share of the DSM within 1.5 pixels, median, 90 % of the sizes, and the bending of the whole (dome). Moved: after the "
-    "best shift, or without the median, which come from the noise of the positions. Up: its source, and its error in "
-    "degrees in the model; control points then level the raster."
+    "All errors in pixels of the raster, inside the square of the flight. Edges: how far visible edges of the "
+    "orthophoto are off across themselves, on the ground and at roofs (steps of a meter); found: edges that are alike. "
+    "Heights: share of the DSM within 1.5 pixels, median, 90 % of the sizes, and the bending of the whole (dome). "
+    "Moved: after the best shift, or without the median, which come from the noise of the positions. Up: its source, "
+    "and its error in degrees in the model; control points then level the raster."
 )
 COLUMNS = (
     "by", "seed", "photos", "pixel cm", "found %", "edges median", "edges 90 %", "roofs median", "roofs 90 %",
-    "edges moved 90 %", "covered %", "within 1.5 px %", "moved", "height median", "height |90 %|", "dome", "up", "up deg", "CPU s of the maps",
-    "failed",
+    "edges moved 90 %", "covered %", "within 1.5 px %", "moved", "height median", "height |90 %|", "dome", "up",
+    "up deg", "CPU s of the maps", "failed",
 )  # fmt: skip
 NOISE_M = 0.05
 HEIGHT_M = 30.0
