@@ -315,7 +315,7 @@ def export_model(
         >>> [path.name for path in files[:2]]
         ['model.obj', 'model.mtl']
     """
-    from sfm_app.exports import check_parts, crop, record_map, stored_model  # loads COLMAP
+    from sfm_app.exports import check_parts, crop, naming_target, record_map, stored_model  # loads COLMAP
 
     plugins = load_plugins()
     place = Path(target) if target is not None else Path(out)
@@ -329,7 +329,7 @@ def export_model(
         model = model if box is None else crop(model, _sorted_box(box))
     files = exporter.write(model, place.stem)
     renamed = dict(zip([place.name, *list(files)[1:]], files.values(), strict=True))
-    with _naming_target(place):
+    with naming_target(place):
         check_parts(place, list(renamed)[1:])
         saved = save_files(renamed, place.parent)
         record_map(run, place.parent)
@@ -364,7 +364,7 @@ def export_scene(
         >>> sorted(path.name for path in folder.iterdir())
         ['export.json', 'images', 'sparse']
     """
-    from sfm_app.exports import StoredScene, check_cloud, fill_folder, record_map  # loads COLMAP
+    from sfm_app.exports import StoredScene, check_cloud, fill_folder, naming_target, record_map  # loads COLMAP
 
     exporter = load_plugins().scene_exporter(file_format)
     if box is not None and exporter.needs != CLOUD:
@@ -376,11 +376,11 @@ def export_scene(
             check_cloud(run)
         if not exporter.file:
             folder = place if target is not None else place / "export" / exporter.name
-            with _naming_target(folder), fill_folder(folder, lambda: scene.record_entries(exporter.name)) as path:
+            with naming_target(folder), fill_folder(folder, lambda: scene.record_entries(exporter.name)) as path:
                 exporter.write(scene, path)
             return folder
         file = _with_suffix(place / exporter.file if place.is_dir() else place, exporter.suffix)
-        with _naming_target(file), replace_atomically(file) as path:
+        with naming_target(file), replace_atomically(file) as path:
             exporter.write(scene, path)
             record_map(run, file.parent)
         return file
@@ -404,15 +404,6 @@ def _with_suffix(place: Path, suffix: str) -> Path:
     if given and given in suffixes | {part.suffix for part in plugins.scene_exporters.values()}:
         raise ConfigError(f"{place.name} does not end in .{suffix}", hint=f"name it {place.stem}.{suffix}")
     return Path(f"{place}.{suffix}")
-
-
-@contextmanager
-def _naming_target(place: Path) -> Iterator[None]:
-    """Turn errors of the file system into one that names the target of an export."""
-    try:
-        yield
-    except OSError as err:
-        raise InputError(f"cannot write {place}: {err.strerror or err}", hint="name another place with -o") from err
 
 
 def measure_distance(out: PathLike, a: ArrayLike, b: ArrayLike) -> "Distance":

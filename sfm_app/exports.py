@@ -318,6 +318,15 @@ ELSEWHERE = "name another place with -o"
 
 
 @contextmanager
+def naming_target(place: Path) -> Iterator[None]:
+    """Turn errors of the file system into one that names the target of an export."""
+    try:
+        yield
+    except OSError as err:
+        raise InputError(f"cannot write {place}: {err.strerror or err}", hint=ELSEWHERE) from err
+
+
+@contextmanager
 def fill_folder(target: Path, about: Callable[[], Mapping[str, object]]) -> Iterator[Path]:
     """Provide an empty folder that replaces `target` at the end, with a record of `about` and its files."""
     check_replaceable(target)

@@ -2,6 +2,7 @@
 
 import os
 import platform
+import re
 import shutil
 import sys
 from collections.abc import Callable
@@ -14,15 +15,7 @@ import click
 from click.shell_completion import get_completion_class
 
 import sfm_app
-from sfm_app.cli.options import (
-    PATH,
-    complete_methods,
-    json_option,
-    output_options,
-    setting_field,
-    settings_from_flags,
-    settings_options,
-)
+from sfm_app.cli.options import PATH, json_option, output_options, setting_field, settings_from_flags, settings_options
 from sfm_app.cli.output import STAGE_TITLES, file_lines, open_browser, print_json, print_lines, print_text, table
 from sfm_app.errors import ConfigError, SfmError
 from sfm_app.wording import parse_length, parse_point
@@ -40,6 +33,14 @@ STAGES = tuple(STAGE_TITLES)
 MARKER_FAMILIES = tuple(name for name in get_args(setting_field("scale.marker_family").annotation) if name != "auto")
 PAPERS = ("a4", "a3", "letter")
 FORMAT_KINDS = ("exporters", "scene_exporters")
+MAPS = {
+    "orthophoto": "Cloud Optimized GeoTIFF of the model from above, or from the front of --plane; QGIS",
+    "dsm": "the same with heights, or distances from --plane",
+    "contours": "GeoPackage with lines of equal height, which follow houses and trees; QGIS",
+}
+"""Formats of `sfm_app.maps`, which loads rasterio."""
+POINT = re.compile(r"[-+]?[\d.]+[^,\s]*,")
+"""Beginning of a point x,y,z."""
 SHELLS = ("bash", "zsh", "fish")
 GIGABYTE, MB_PER_GB = 2**30, 2**30 / 1e6
 ENOUGH_DISK = 2 * GIGABYTE
@@ -241,10 +242,18 @@ def report(out: Path, compare: Path | None) -> None:
 class ExportCommand(click.Command):
     """A command whose help ends with the list of formats, those of plug-ins included."""
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Join the points behind --plane, which may begin with a minus, to one word."""
+        joined = list[str]()
+        for word in args:
+            joins = "--plane" in joined[-2:-1] and POINT.match(word) and POINT.match(joined[-1])
+            joined[-1:] = [f"{joined[-1]} {word}"] if joins else [*joined[-1:], word]
+        return super().parse_args(ctx, joined)
+
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list of formats."""
         with formatter.section("Formats"):
-            formatter.write_dl([(name, part.summary) for name, part in known_formats().items()])
+            formatter.write_dl(list(format_summaries().items()))
         super().format_epilog(ctx, formatter)
 
 
@@ -255,7 +264,7 @@ class ExportCommand(click.Command):
     "file_format",
     default="",
     metavar="NAME",
-    shell_complete=complete_methods(*FORMAT_KINDS),
+    shell_complete=lambda _ctx, _parameter, start: [name for name in format_summaries() if name.startswith(start)],
     help="One of the formats below.  [default: the suffix of the output file]",
 )
 @click.option(
@@ -269,28 +278,45 @@ class ExportCommand(click.Command):
 @click.option(
     "--box", nargs=2, metavar="A B", help="Export what is between these corners, x,y,z in the frame of OUT/model.glb."
 )
+@click.option(
+    "--resolution", default="", metavar="LENGTH", help="Pixel of a map, such as 2cm.  [default: as the photos]"
+)
+@click.option(
+    "--plane",
+    default="",
+    metavar="A B [C]",
+    help="Map of a plane, by 3 points x,y,z as in `measure`; 2 points: of a section; `facade`: of the main wall.",
+)
+@click.option("--interval", default="", metavar="LENGTH", help="Step of contours.  [default: twenty or more]")
 @output_options
-def export(
-    out: Path,
-    file_format: str,
-    target: Path | None,
-    points: bool,
-    box: tuple[str, str] | None,
-    quiet: bool,
-    as_json: bool,
-) -> None:
+def export(  # noqa: PLR0913 - the options of the command
+    out: Path, file_format: str, target: Path | None, points: bool, box: tuple[str, str] | None, resolution: str,
+    plane: str, interval: str, quiet: bool, as_json: bool,
+) -> None:  # fmt: skip
     """Write the results of the run in OUT for another program, without recomputing anything."""
     from sfm_app.cli.terminal import Terminal
+    from sfm_app.formats.exporters import CLOUD
     from sfm_app.plugins import load_plugins
 
-    name = choose_format(file_format, target)
+    name, methods = choose_format(file_format, target), load_plugins()
     try:
         corners = None if box is None else [parse_point(corner) for corner in box]
     except ValueError as err:
         raise ConfigError(str(err), hint="--box -1,0,-0.5 1,2,0.5") from None
-    if name in load_plugins().scene_exporters:
-        if points:
-            raise ConfigError(f"--points does not apply to the format '{name}'", hint="omit it")
+    is_model, is_map = name in methods.exporters, name in MAPS
+    is_cloud = name in methods.scene_exporters and methods.scene_exporters[name].needs == CLOUD
+    fits = {"points": is_model, "box": is_model or is_cloud, "resolution": is_map, "plane": is_map}
+    fits["interval"] = name == "contours"
+    given = {"points": points, "box": box, "resolution": resolution, "plane": plane, "interval": interval}
+    for option, value in given.items():
+        if value and not fits[option]:
+            raise ConfigError(f"--{option} does not apply to the format '{name}'", hint="omit it")
+    if is_map:
+        from sfm_app.maps.products import MapOptions, export_map
+
+        with Terminal(quiet=quiet or as_json) as progress:
+            paths = list(export_map(out, name, target, MapOptions(resolution, plane, interval), progress=progress))
+    elif name in methods.scene_exporters:
         with Terminal(quiet=quiet or as_json) as progress:
             paths = [sfm_app.export_scene(out, name, target, box=corners, progress=progress)]
     else:
@@ -306,6 +332,11 @@ def known_formats() -> "dict[str, Exporter | SceneExporter]":
     return {**methods.exporters, **methods.scene_exporters}
 
 
+def format_summaries() -> dict[str, str]:
+    """Return the summaries of all formats by name."""
+    return {name: part.summary for name, part in known_formats().items()} | MAPS
+
+
 def choose_format(name: str, target: Path | None) -> str:
     """Return the name of a format; an empty one stands for the suffix of the target; ConfigError for an unknown one."""
     formats = known_formats()
@@ -313,9 +344,9 @@ def choose_format(name: str, target: Path | None) -> str:
     if not name and suffix:  # a format of that name has priority over others with that suffix
         matches = [key for key, part in formats.items() if part.suffix == suffix]
         name = suffix if suffix in formats else next(iter(matches), suffix)
-    if name in formats:
+    if name in formats or name in MAPS:
         return name
-    lines = [f"  {line}" for line in table({key: part.summary for key, part in formats.items()})]
+    lines = [f"  {line}" for line in table(format_summaries())]
     message = f"no file format is named '{name}'" if name else "no format is given"
     raise ConfigError(message, hint="\n".join(["add --format with one of these, or -o model.obj:", *lines]))
 

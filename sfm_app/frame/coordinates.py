@@ -175,6 +175,8 @@ class MapFrame:
         self._system = known if known.crs.is_projected or known.is_flat else _utm(known, self._local.center)
         self.wkt = "" if known.is_flat else _well_known_text(self._system.given)
         """Its system; empty for axes of the user's own."""
+        self.title, self.unit_m, self.z_m = self._system.title, self._system.unit, self._system.z_m
+        """Name for people; meters per unit of x and y, and of z; the latter is negative for depths."""
 
     def positions(self, points: FloatArray) -> FloatArray:
         """Return points (N, 3) of the frame on the map: x east, y north, z up, in units of the system."""

@@ -35,8 +35,9 @@ class OPTIONS:
     max_up_deviation_deg: float = 2.0
     """Largest standard deviation with which up from GPS replaces up from the cameras' roll."""
     max_pairs: int = 500
-    min_swap_gain: float = 2.0
-    """Least factor by which swapping latitude and longitude reduces the residuals of a file that has them swapped."""
+    min_gain: float = 2.0
+    """Least factor by which swapping latitude and longitude reduces the residuals of a file that has them swapped, and
+    by which up from positions reduces those with a sure up, which is then wrong."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +66,8 @@ def georeference(
 
     GPS errs by 3 to 10 m horizontally and twice that in height. So up stays as given, and only horizontal positions
     are used: w = a z + b in complex numbers, by RANSAC over pairs, then least squares. An unsure up is replaced by that
-    of the positions if they determine it well. Centers (N, 3) and `up` (3,) are in the frame of the reconstruction.
+    of the positions if they determine it well; a sure one, if it leaves residuals that theirs does not. Centers (N, 3)
+    and `up` (3,) are in the frame of the reconstruction.
     """
     cameras = centers[[position is not None for position in positions]]
     given = [position for position in positions if position is not None]
@@ -79,7 +81,7 @@ def georeference(
     swapped = [replace(one, latitude_deg=one.longitude_deg, longitude_deg=one.latitude_deg) for one in given]
     other = _fit_positions(cameras, swapped, up, up_is_sure)
     rms_m = fit.rms_m if isinstance(fit, Georeference) else np.inf
-    if isinstance(other, Georeference) and OPTIONS.min_swap_gain * other.rms_m < min(rms_m, _width(swapped)):
+    if isinstance(other, Georeference) and OPTIONS.min_gain * other.rms_m < min(rms_m, _width(swapped)):
         now = f"they miss by {rms_m:.2g} m" if fit else "they do not agree"
         place = "file of positions" if given[0].zero == FILE else "EXIF"
         swap = "latitude and longitude are probably swapped"
@@ -98,11 +100,13 @@ def _fit_positions(
     origin = _median_position(given)
     enu = enu_m(given, origin)
     level = _fit_on_ground(cameras, enu, up, given)
-    if up_is_sure and level:
-        return level
     gps_up = _up_from_positions(cameras, enu, given)
     tilted = _fit_on_ground(cameras, enu, gps_up[0], given) if gps_up else level
-    return replace(tilted, up_deviation_deg=gps_up[1]) if gps_up and isinstance(tilted, Georeference) else level
+    if gps_up is None or not isinstance(tilted, Georeference):
+        return level
+    if up_is_sure and isinstance(level, Georeference) and OPTIONS.min_gain * tilted.rms_m > level.rms_m:
+        return level
+    return replace(tilted, up_deviation_deg=gps_up[1])
 
 
 def enu_m(positions: Sequence[GpsPosition], origin: GpsPosition) -> FloatArray:

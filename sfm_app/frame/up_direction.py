@@ -15,7 +15,7 @@ from sfm_app.frame.vanishing_points import Segments, find_vanishing_direction, f
 from sfm_app.geometry import poses
 from sfm_app.types.arrays import ByteArray, FloatArray, IndexArray
 
-LINES, ROLL, GROUND, GPS = "vanishing lines", "camera roll", "ground plane", "GPS"
+LINES, ROLL, GROUND, GPS, FLIGHT = "vanishing lines", "camera roll", "ground plane", "GPS", "flight"
 WALL, CAMERAS = "wall", "cameras"
 
 
@@ -44,6 +44,21 @@ class OPTIONS:
     """Range of the angle between up and the normals of walls."""
     square_deg: float = 30.0
     """Largest angle by which a front is turned to face the viewer; a view of a corner is kept."""
+    flight_photos: int = 6
+    """Least number of photos of a flight. Chosen by hand: two lines of three."""
+    flight_deg: float = 15.0
+    """Largest angle of most optical axes of a flight to their median, and of this to the normal of the cameras' plane.
+    Chosen by hand: gimbals and wind err by a few degrees. Of 13 sets that people took, 6 have such axes, and their
+    normals are 56 degrees off or more."""
+    flight_most: float = 0.6
+    """Share of these axes. Chosen by hand: a round of oblique photos is common."""
+    flight_share: float = 0.15
+    """Least deviation of the cameras across the flight, as a share of their height. Chosen by hand: two lines with 70 %
+    overlap have 0.16; people at a wall vary their height by 0.1 of their distance."""
+    flight_depth: float = 0.3
+    """Largest deviation of the cameras along the view, as a share of that across the flight. Chosen by hand."""
+    flight_nats: float = 3.0
+    """Log odds that such photos show the ground and no wall. Chosen by hand: one of twenty flights scans a wall."""
     quantiles: tuple[float, float] = (0.2, 0.8)
     """Quantiles of the points with the middle of the scene halfway between them."""
 
@@ -133,7 +148,7 @@ class UpEstimate:
     level: FloatArray | None
     """(3,) main horizontal direction of the lines, perpendicular to `up`; None without one."""
     method: str
-    """Source of `up`: `LINES`, `ROLL`, `GROUND` or `GPS`."""
+    """Source of `up`: `LINES`, `ROLL`, `GROUND`, `GPS` or `FLIGHT`."""
     deviation_deg: float
     """Standard deviation of `up`, from its evidence."""
     roll: up_cues.Roll
@@ -191,10 +206,14 @@ def odds(nats: float) -> float:
 def up_direction(
     rotations: FloatArray, centers: FloatArray, scenery: Scenery, segments: Segments, turn_deg: int | None = None
 ) -> UpEstimate:
-    """Find up from vertical lines near that of the cameras' roll, or else from the ground or the roll."""
+    """Find up from a flight, vertical lines near that of the cameras' roll, or else from the ground or the roll."""
     rolls = up_cues.roll_hypotheses(rotations, centers)
     if turn_deg is None:
         upright = select_roll(rolls, rotations, centers, scenery)
+        flight = flight_direction(rotations, centers, scenery.points)
+        if flight is not None:  # lines on the ground would pass for verticals
+            sure = replace(upright, evidence={}, sign_log_odds=np.inf, axis_log_odds=OPTIONS.flight_nats)
+            return replace(sure, up=flight[0], method=FLIGHT, deviation_deg=flight[1])
     else:
         roll = rolls[turn_deg // 90]
         upright = UpEstimate(roll.up, None, ROLL, roll.deviation_deg, roll, {}, np.inf, np.inf)
@@ -215,6 +234,28 @@ def up_direction(
         if ground is not None:
             return replace(upright, up=ground[0], method=GROUND, deviation_deg=ground[1])
     return upright
+
+
+def flight_direction(rotations: FloatArray, centers: FloatArray, points: FloatArray) -> tuple[FloatArray, float] | None:
+    """Return up (3,) and its deviation in degrees if photos were taken from above, in several lines; else None.
+
+    Most axes are parallel, and the centers lie in a plane across these. People who photograph a wall stand on one
+    line. Up is the normal of that plane, since drones keep their height.
+    """
+    if len(centers) < OPTIONS.flight_photos:
+        return None
+    axis = poses.normalize(np.median(rotations[:, 2], axis=0))
+    angles = np.degrees(np.arccos(np.clip(rotations[:, 2] @ axis, -1.0, 1.0)))
+    spread = centers - centers.mean(axis=0)
+    scatter = np.einsum("ni,nj->ij", spread, spread) / len(centers)
+    small, across, _ = np.sqrt(np.maximum(np.linalg.eigvalsh(scatter), 0.0))
+    height = float(np.median((points - centers.mean(axis=0)) @ axis))
+    normal = poses.smallest_eigenvector(scatter, -axis)
+    parallel = np.quantile(angles, OPTIONS.flight_most) <= OPTIONS.flight_deg >= poses.axis_angle_deg(normal, axis)
+    flat = small <= OPTIONS.flight_depth * across
+    if not (parallel and flat and height > 0.0 and across >= OPTIONS.flight_share * height):
+        return None
+    return normal, float(np.degrees(np.arctan2(small / np.sqrt(len(centers)), across)))
 
 
 def viewer_direction(upright: UpEstimate, rotations: FloatArray, points: FloatArray) -> tuple[FloatArray, str]:

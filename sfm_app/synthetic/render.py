@@ -74,7 +74,7 @@ def render_scene(
             shows = np.isfinite(rays[:, 0])
             center, directions = _to_world(np.where(shows[:, None], rays, [0.0, 0.0, 1.0]), cam_from_world)
             hits = cast_rays(scene.rays, center, directions)
-            lit = _is_sunlit(scene, center, directions, hits)
+            lit = is_sunlit(scene, center, directions, hits)
             # t_hit is the z depth where rays have z = 1, else the distance; a pixel covers t_hit / f on the surface
             pixel = np.where(np.isfinite(hits["t_hit"]), hits["t_hit"], 1.0) / camera.K[0, 0]
             shade(
@@ -113,7 +113,7 @@ def cast_rays(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[s
     return {key: hits[key].numpy() for key in ("t_hit", "primitive_ids", "primitive_uvs", "primitive_normals")}
 
 
-def _is_sunlit(
+def is_sunlit(
     scene: PreparedScene, center: FloatArray, directions: FloatArray, hits: dict[str, NDArray[Any]]
 ) -> BoolArray:
     """Return whether the sun reaches each hit; shadow rays are cast only where the surface faces the sun."""

@@ -336,7 +336,7 @@ def test_a_box_cuts_the_dense_cloud(make_run, tmp_path, name):
     [
         (("--format", "obj", "--box", "5,5,5", "6,6,6"), 3, "nothing of the model is in the box"),
         (("--format", "obj", "--box", "5,5", "6,6,6"), 2, "'5,5' is no point"),
-        (("--format", "colmap", "--box", "0,0,0", "1,1,1"), 2, "a box does not apply to the format 'colmap'"),
+        (("--format", "colmap", "--box", "0,0,0", "1,1,1"), 2, "--box does not apply to the format 'colmap'"),
     ],
 )
 def test_boxes_that_are_of_no_use_are_refused(finished, arguments, code, says):

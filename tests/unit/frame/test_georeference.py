@@ -109,6 +109,30 @@ def test_a_drone_says_where_up_is_when_its_cameras_do_not():
     assert not georeference(enu / METRES, flat, wrong, up_is_sure=False)
 
 
+def test_exact_positions_overrule_lines_that_lie_on_the_ground():
+    """Photos of fields from above: on its side, the model still agrees with most positions to some meters."""
+    rng = np.random.default_rng(0)
+    enu = np.stack([np.repeat([-12.0, 0.0, 12.0], 7), np.tile(np.linspace(-12, 12, 7), 3), 30 + rng.normal(size=21)], 1)
+    lying = np.array([np.sin(0.4), np.cos(0.4), 0.0])
+
+    def found(noise_m):
+        positions = [position_from_enu(row + rng.normal(scale=noise_m, size=3), ORIGIN) for row in enu]
+        return georeference(enu / METRES, positions, lying)
+
+    exact = found(0.05)
+    assert exact.enu_from_world.R[2] == pytest.approx([0, 0, 1], abs=0.01) and exact.rms_m < 0.1
+    assert exact.enu_from_world.scale == pytest.approx(METRES, rel=0.01) and exact.up_deviation_deg < 0.5
+
+
+def test_positions_that_fit_a_sure_up_leave_it():
+    """Up from positions is a degree off: lines are better, and both leave the same residuals."""
+    centers, positions, up, _ = walk(12, 60.0, 0.5)
+    rng = np.random.default_rng(1)
+    positions = [replace(position, altitude_m=180.0 + rng.normal(scale=0.5)) for position in positions]
+    found = georeference(centers, positions, up)
+    assert found.up_deviation_deg is None
+
+
 @pytest.mark.parametrize("up_is_sure", [True, False])
 def test_cameras_too_near_each_other_for_numbers_have_no_place(up_is_sure):
     centers, positions, up, _ = walk(12, 60.0, 3.0)

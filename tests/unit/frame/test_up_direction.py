@@ -2,15 +2,18 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sfm_app.frame.up_direction import (
     CAMERAS,
+    FLIGHT,
     GROUND,
     LINES,
     ROLL,
     WALL,
     Scenery,
     dominant_plane,
+    flight_direction,
     up_direction,
     viewer_direction,
     viewer_frame,
@@ -191,3 +194,60 @@ def test_points_without_noise_give_a_plane_without_deviation(seed):
 )
 def test_no_points_one_place_and_a_line_have_no_plane(points):
     assert dominant_plane(points, np.array([0.0, 1.0, 0.0]), (0.0, 20.0)) is None
+
+
+def survey(down, *, lines=3, photos=7, one_way=False, lean_deg=2.0, apart=0.4, ahead=0.0, seed=0):
+    """Photos on a grid, 1 away from a rough plane that lies along `down`; photos of every second line are turned.
+
+    Lines are `apart` from each other, and `ahead` of each other along the view.
+    """
+    rng = np.random.default_rng(seed)
+    turned = Rotation.random(random_state=seed + 9).as_matrix()
+    right = np.array([1.0, 0.0, 0.0])
+    level = np.stack([right, np.cross(down, right), down])
+    rotations, centers = [], []
+    for line in range(lines):
+        for k in range(photos):
+            back = 180.0 if line % 2 and not one_way else 0.0
+            lean = Rotation.from_euler("xyz", [*rng.normal(scale=lean_deg, size=2), back + rng.normal(scale=2.0)], True)
+            rotations.append(lean.as_matrix() @ level @ turned.T)
+            place = np.array([apart * line, 0.2 * k, ahead * line]) + rng.normal(scale=[0.02, 0.02, 0.01], size=3)
+            centers.append(turned @ (level.T @ place))
+    points = rng.uniform([-0.5, -0.5, 0.9], [1.5, 2.0, 1.05], (400, 3)) @ level @ turned.T
+    return np.array(rotations), np.array(centers), points, turned
+
+
+DOWN = np.array([0.0, -1.0, 0.0])
+
+
+@pytest.mark.parametrize("one_way", [True, False])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_photos_on_a_grid_that_look_one_way_are_a_map(one_way, seed):
+    rotations, centers, points, turned = survey(DOWN, one_way=one_way, seed=seed)
+    scenery = Scenery(points, np.full(len(points), 100.0), (np.arange(len(points)),) * len(centers), (None,) * 21)
+    upright = up_direction(rotations, centers, scenery, concatenate_segments([]))
+    assert upright.method == FLIGHT and np.exp(upright.axis_log_odds) > 10
+    assert error_deg(upright.up, turned[:, 1]) < min(1.0, 4.0 * upright.deviation_deg)
+    told = up_direction(rotations, centers, scenery, concatenate_segments([]), turn_deg=0)
+    assert told.method == ROLL  # who knows that it is a wall is believed
+
+
+def test_a_flight_with_a_round_of_oblique_photos():
+    rotations, centers, points, turned = survey(DOWN)
+    leaning = [Rotation.from_euler("x", angle, True).as_matrix() for angle in (35.0, 40.0, 45.0, 38.0)]
+    oblique = np.array([lean @ R for lean, R in zip(leaning * 2, rotations[::3], strict=False)])
+    found = flight_direction(np.concatenate([rotations, oblique]), np.concatenate([centers, centers[::3]]), points)
+    assert found is not None and error_deg(found[0], turned[:, 1]) < 1.0
+
+
+def test_what_is_no_flight():
+    rotations, centers, points, _ = survey(DOWN)
+    assert flight_direction(rotations, centers, points) is not None
+    assert flight_direction(*survey(DOWN, lean_deg=25.0)[:3]) is None  # views of a thing from all sides
+    assert flight_direction(*survey(DOWN, lines=1, photos=12)[:3]) is None  # a walk along a wall
+    assert flight_direction(*survey(DOWN, lines=2, apart=0.1)[:3]) is None  # with the camera held high and low
+    assert flight_direction(*survey(DOWN, apart=0.0, ahead=-0.4)[:3]) is None  # a crowd on a square
+    assert flight_direction(rotations[:5], centers[:5], points) is None
+    assert flight_direction(rotations, centers, centers - (points - centers.mean(axis=0))[: len(centers)]) is None
+    mixed = centers + 0.2 * np.random.default_rng(0).normal(size=(21, 1)) * rotations[:, 2]  # near and far
+    assert flight_direction(rotations, mixed, points) is None

@@ -1,0 +1,1 @@
+"""Orthophotos and elevation models of rendered land, against the truth."""
