@@ -59,6 +59,10 @@ class OPTIONS:
     """Largest deviation of the cameras along the view, as a share of that across the flight. Chosen by hand."""
     flight_nats: float = 3.0
     """Log odds that such photos show the ground and no wall. Chosen by hand: one of twenty flights scans a wall."""
+    one_way_nats: float = 2.0
+    """The same where no line turns the photos around, as at a wall. Chosen by hand: odds of 7, which a warning states."""
+    one_way: float = 0.9
+    """Least length of the mean of their sides that do not turn. Chosen by hand: lines there and back have 0 to 0.3."""
     quantiles: tuple[float, float] = (0.2, 0.8)
     """Quantiles of the points with the middle of the scene halfway between them."""
 
@@ -212,8 +216,9 @@ def up_direction(
         upright = select_roll(rolls, rotations, centers, scenery)
         flight = flight_direction(rotations, centers, scenery.points)
         if flight is not None:  # lines on the ground would pass for verticals
-            sure = replace(upright, evidence={}, sign_log_odds=np.inf, axis_log_odds=OPTIONS.flight_nats)
-            return replace(sure, up=flight[0], method=FLIGHT, deviation_deg=flight[1])
+            up, deviation_deg, nats = flight
+            sure = replace(upright, evidence={}, sign_log_odds=np.inf, axis_log_odds=nats)
+            return replace(sure, up=up, method=FLIGHT, deviation_deg=deviation_deg)
     else:
         roll = rolls[turn_deg // 90]
         upright = UpEstimate(roll.up, None, ROLL, roll.deviation_deg, roll, {}, np.inf, np.inf)
@@ -236,10 +241,12 @@ def up_direction(
     return upright
 
 
-def flight_direction(rotations: FloatArray, centers: FloatArray, points: FloatArray) -> tuple[FloatArray, float] | None:
-    """Return up (3,) and its deviation in degrees if photos were taken from above, in several lines; else None.
+def flight_direction(
+    rotations: FloatArray, centers: FloatArray, points: FloatArray
+) -> tuple[FloatArray, float, float] | None:
+    """Return up (3,), its deviation in degrees, and the log odds against a wall; None for photos of no flight.
 
-    Most axes are parallel, and the centers lie in a plane across these. People who photograph a wall stand on one
+    Most axes of a flight are parallel, and the centers lie in a plane across these. People who photograph a wall stand on one
     line. Up is the normal of that plane, since drones keep their height.
     """
     if len(centers) < OPTIONS.flight_photos:
@@ -255,7 +262,10 @@ def flight_direction(rotations: FloatArray, centers: FloatArray, points: FloatAr
     flat = small <= OPTIONS.flight_depth * across
     if not (parallel and flat and height > 0.0 and across >= OPTIONS.flight_share * height):
         return None
-    return normal, float(np.degrees(np.arctan2(small / np.sqrt(len(centers)), across)))
+    sides = rotations[angles <= OPTIONS.flight_deg, 0]
+    is_one_way = np.linalg.norm(sides.mean(axis=0)) >= OPTIONS.one_way
+    deviation_deg = float(np.degrees(np.arctan2(small / np.sqrt(len(centers)), across)))
+    return normal, deviation_deg, OPTIONS.one_way_nats if is_one_way else OPTIONS.flight_nats
 
 
 def viewer_direction(upright: UpEstimate, rotations: FloatArray, points: FloatArray) -> tuple[FloatArray, str]:
