@@ -60,9 +60,9 @@ class OPTIONS:
     flight_nats: float = 3.0
     """Log odds that such photos show the ground and no wall. Chosen by hand: one of twenty flights scans a wall."""
     one_way_nats: float = 2.0
-    """The same where no line turns the photos around, as at a wall. Chosen by hand: odds of 7, which a warning states."""
+    """The same where no line turns the photos around, as at a wall. Chosen by hand: 7 to 1, which a warning states."""
     one_way: float = 0.9
-    """Least length of the mean of their sides that do not turn. Chosen by hand: lines there and back have 0 to 0.3."""
+    """Least length of the mean of their right sides. Chosen by hand: lines there and back have 0 to a third."""
     quantiles: tuple[float, float] = (0.2, 0.8)
     """Quantiles of the points with the middle of the scene halfway between them."""
 
@@ -246,8 +246,8 @@ def flight_direction(
 ) -> tuple[FloatArray, float, float] | None:
     """Return up (3,), its deviation in degrees, and the log odds against a wall; None for photos of no flight.
 
-    Most axes of a flight are parallel, and the centers lie in a plane across these. People who photograph a wall stand on one
-    line. Up is the normal of that plane, since drones keep their height.
+    Most axes of a flight are parallel, and its centers lie in a plane across these. People who photograph a wall stand
+    on one line. Up is the normal of that plane, since drones keep their height.
     """
     if len(centers) < OPTIONS.flight_photos:
         return None
