@@ -36,7 +36,8 @@ FORMAT_KINDS = ("exporters", "scene_exporters")
 MAPS = {
     "orthophoto": "Cloud Optimized GeoTIFF of the model from above, or from the front of --plane; QGIS",
     "dsm": "the same with heights, or distances from --plane",
-    "contours": "GeoPackage with lines of equal height, which follow houses and trees; QGIS",
+    "dtm": "the same of the bare ground, without houses and trees",
+    "contours": "GeoPackage with lines of equal height; QGIS",
 }
 """Formats of `sfm_app.maps`, which loads rasterio."""
 POINT = re.compile(r"[-+]?[\d.]+[^,\s]*,")
@@ -288,10 +289,11 @@ class ExportCommand(click.Command):
     help="Map of a plane, by 3 points x,y,z as in `measure`; 2 points: of a section; `facade`: of the main wall.",
 )
 @click.option("--interval", default="", metavar="LENGTH", help="Step of contours.  [default: twenty or more]")
+@click.option("--ground", is_flag=True, help="Contours of the bare ground, without houses and trees.")
 @output_options
 def export(  # noqa: PLR0913 - the options of the command
     out: Path, file_format: str, target: Path | None, points: bool, box: tuple[str, str] | None, resolution: str,
-    plane: str, interval: str, quiet: bool, as_json: bool,
+    plane: str, interval: str, ground: bool, quiet: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Write the results of the run in OUT for another program, without recomputing anything."""
     from sfm_app.cli.terminal import Terminal
@@ -306,8 +308,9 @@ def export(  # noqa: PLR0913 - the options of the command
     is_model, is_map = name in methods.exporters, name in MAPS
     is_cloud = name in methods.scene_exporters and methods.scene_exporters[name].needs == CLOUD
     fits = {"points": is_model, "box": is_model or is_cloud, "resolution": is_map, "plane": is_map}
-    fits["interval"] = name == "contours"
+    fits |= dict.fromkeys(("interval", "ground"), name == "contours")
     given = {"points": points, "box": box, "resolution": resolution, "plane": plane, "interval": interval}
+    given["ground"] = ground
     for option, value in given.items():
         if value and not fits[option]:
             raise ConfigError(f"--{option} does not apply to the format '{name}'", hint="omit it")
@@ -315,7 +318,8 @@ def export(  # noqa: PLR0913 - the options of the command
         from sfm_app.maps.products import MapOptions, export_map
 
         with Terminal(quiet=quiet or as_json) as progress:
-            paths = list(export_map(out, name, target, MapOptions(resolution, plane, interval), progress=progress))
+            options = MapOptions(resolution, plane, interval, ground)
+            paths = list(export_map(out, name, target, options, progress=progress))
     elif name in methods.scene_exporters:
         with Terminal(quiet=quiet or as_json) as progress:
             paths = [sfm_app.export_scene(out, name, target, box=corners, progress=progress)]

@@ -11,7 +11,7 @@ import numpy as np
 
 from sfm_app.errors import InputError
 from sfm_app.files import replace_atomically
-from sfm_app.maps.drawing import Grid, Tile
+from sfm_app.maps.drawing import Grid, Tile, assemble
 from sfm_app.types.arrays import FloatArray
 
 Contour = tuple[float, FloatArray]
@@ -56,10 +56,7 @@ def find_contours(tiles: Iterable[Tile], grid: Grid, interval: float = 0.0) -> I
     """Yield the lines at multiples of an interval, of a round one if it is 0; InputError if these are too many."""
     import contourpy
 
-    heights = np.full((grid.height, grid.width), np.nan)
-    for tile in tiles:
-        size = tile.heights.shape
-        heights[tile.row : tile.row + size[0], tile.column : tile.column + size[1]] = tile.heights
+    heights = assemble(tiles, grid).astype(np.float64)
     known = heights[np.isfinite(heights)]
     if not len(known):
         return

@@ -5,7 +5,7 @@ and u, v on a page of the texture. The highest triangle wins. A triangle seen fr
 lies behind it shows.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from math import ceil, floor
 
@@ -150,6 +150,15 @@ def draw_tiles(
             if len(own):
                 size = min(side, grid.height - row), min(side, grid.width - column)
                 yield _draw_tile(pixels[own], page[own], pages, (row, column), size, rays, base)
+
+
+def assemble(tiles: Iterable[Tile], grid: Grid) -> NDArray[np.float32]:
+    """Return the heights (H, W) of all tiles; NaN in holes."""
+    heights = np.full((grid.height, grid.width), np.nan, np.float32)
+    for tile in tiles:
+        size = tile.heights.shape
+        heights[tile.row : tile.row + size[0], tile.column : tile.column + size[1]] = tile.heights
+    return heights
 
 
 def _draw_tile(

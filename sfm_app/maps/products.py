@@ -1,16 +1,30 @@
 """Orthophoto, elevation model and contours of a finished run, step by step."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
+
+import numpy as np
 
 from sfm_app.api import PathLike, open_run
 from sfm_app.engine.stage import resume_hint
 from sfm_app.errors import ConfigError, InputError, ReconstructionError
 from sfm_app.exports import naming_target, stored_frame, stored_model
 from sfm_app.maps.contours import contour_pixel, find_contours, write_geopackage
-from sfm_app.maps.drawing import count_tiles, cover, cut_front, draw_tiles, facing_corners, rays_per_pixel, texel_size
+from sfm_app.maps.drawing import (
+    Tile,
+    assemble,
+    count_tiles,
+    cover,
+    cut_front,
+    draw_tiles,
+    facing_corners,
+    rays_per_pixel,
+    texel_size,
+)
 from sfm_app.maps.geotiff import check_rasterio, write_cog
+from sfm_app.maps.ground import bare_ground
 from sfm_app.maps.projections import Projection, project, read_plane
 from sfm_app.maps.sheets import Caption, write_sheet
 from sfm_app.pipeline import TEXTURE
@@ -19,8 +33,9 @@ from sfm_app.runtime.context import RunContext
 from sfm_app.settings import Settings
 from sfm_app.wording import format_length, parse_length
 
-ORTHOPHOTO, DSM, CONTOURS = "orthophoto", "dsm", "contours"
-SUFFIXES = {ORTHOPHOTO: "tif", DSM: "tif", CONTOURS: "gpkg"}
+ORTHOPHOTO, DSM, DTM, CONTOURS = "orthophoto", "dsm", "dtm", "contours"
+SUFFIXES = {ORTHOPHOTO: "tif", DSM: "tif", DTM: "tif", CONTOURS: "gpkg"}
+GIVE_SIZE = "give it with --gcp, --markers or --scale of `sfm-app run`"
 UNSCALED = "--{option} 0.01, in the unit of the scene; --gcp, --markers or --scale of `sfm-app run` give it meters"
 FOOT = 0.3048
 """Meters, by definition; the foot of the US survey is 2e-6 longer."""
@@ -38,27 +53,30 @@ class MapOptions:
     x,y,z in the frame of exported files, with blanks between them."""
     interval: str = ""
     """Step of contours, written as the resolution; empty for a round one with twenty heights or more."""
+    ground: bool = False
+    """Whether contours follow the bare ground."""
 
 
 def export_map(
     out: PathLike, product: str, target: PathLike | None = None, options: MapOptions | None = None, *,
     progress: Progress | Callback | None = None,
 ) -> tuple[Path, ...]:  # fmt: skip
-    """Write the orthophoto or the elevation model (DSM) of a finished run as a Cloud Optimized GeoTIFF, or contours.
+    """Write the orthophoto or heights of a finished run as a Cloud Optimized GeoTIFF, or contours as a GeoPackage.
 
-    Contours are a GeoPackage, and follow houses and trees as the DSM does. A map lies in the run's system or UTM zone
+    The DSM follows houses and trees, the DTM is the bare ground. A map lies in the run's system or UTM zone
     where GPS or control points give a place, else in a plane. Three points are counterclockwise for the viewer. A
     section shows what lies behind it, its first point at the left.
 
     Args:
-        product: "orthophoto", "dsm" or "contours".
+        product: "orthophoto", "dsm", "dtm" or "contours".
         target: file to write; None for OUT/orthophoto.tif, OUT/dsm.tif, or with a plane OUT/orthophoto-plane.tif, ...
 
     Returns:
         The file and, for a GeoTIFF of a plane, the same with a scale bar as PNG and as PDF, which prints to scale.
 
     Raises:
-        ConfigError: rasterio is missing; the product, the plane or the resolution is none.
+        ConfigError: rasterio is missing; the product, the plane or the resolution is none; a DTM is of a wall, or of
+            unknown size.
         InputError: the run has no model yet, the raster is too large, or the target cannot be written.
         ReconstructionError: nothing of the surface faces the viewer.
 
@@ -72,7 +90,12 @@ def export_map(
         raise ConfigError(f"'{product}' is no map", hint=f"one of {', '.join(SUFFIXES)}")
     if options.interval and product != CONTOURS:
         raise ConfigError(f"--interval does not apply to {product}", hint="omit it")
-    if product != CONTOURS:
+    if options.ground and product != CONTOURS:
+        raise ConfigError(f"--ground does not apply to {product}", hint=f"--format {DTM} is the bare ground")
+    is_ground = product == DTM or options.ground
+    if is_ground and options.plane:
+        raise ConfigError("a plane has no bare ground", hint="omit --plane")
+    if product != CONTOURS or is_ground:
         check_rasterio()
     if options.plane:
         read_plane(options.plane)  # fail before files are read
@@ -97,18 +120,25 @@ def _write(run: RunContext, product: str, target: Path, options: MapOptions) -> 
     if not len(corners):
         raise ReconstructionError("nothing of the surface faces the viewer", hint="swap two points of --plane")
     texel = texel_size(corners, page, model.texture)
-    resolution = contour_pixel(corners, texel) if product == CONTOURS else texel
+    is_ground = product == DTM or options.ground
+    if is_ground and not (shown.unit_m and shown.height_m):
+        raise ConfigError("bare ground needs the size of the scene: houses are told by it", hint=GIVE_SIZE)
+    resolution = contour_pixel(corners, texel) if is_ground or product == CONTOURS else texel
     resolution = _read_length("resolution", options.resolution, shown.unit_m) or resolution
     grid, rays = cover(corners, resolution), rays_per_pixel(resolution, texel) if product == ORTHOPHOTO else 1
     run.progress.say(_describe(product, shown, resolution, _texture_scale(run)))
     pages = model.texture.pages if product == ORTHOPHOTO else ()
-    tiles = track(run.progress, draw_tiles(corners, page, pages, grid, rays), "drawing", count_tiles(grid, rays))
+    drawn = draw_tiles(corners, page, pages, grid, rays)
+    tiles: Iterable[Tile] = track(run.progress, drawn, "drawing", count_tiles(grid, rays))
+    if is_ground:
+        heights = bare_ground(assemble(tiles, grid), resolution * shown.unit_m, shown.height_m)
+        tiles = [Tile(0, 0, np.zeros((*heights.shape, 0), np.uint8), heights)]
     with naming_target(target):
         if product == CONTOURS:
             interval = _read_length("interval", options.interval, shown.height_m)
             write_geopackage(find_contours(tiles, grid, interval), shown.wkt, target)
             return (target,)
-        write_cog(tiles, grid, shown.wkt, target, _unit_name(shown.height_m) if product == DSM else None)
+        write_cog(tiles, grid, shown.wkt, target, _unit_name(shown.height_m) if product in (DSM, DTM) else None)
         if not options.plane:
             return (target,)
         return (target, *write_sheet(target, Caption(product, shown.title, shown.unit_m)))
