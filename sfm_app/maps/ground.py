@@ -3,11 +3,15 @@
 No wheel for all versions of Python has a filter; this one is openings by OpenCV, with the values of the paper.
 """
 
+from collections.abc import Callable
 from math import ceil
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from sfm_app.types.arrays import BoolArray
 
 CELL_M = 0.5
 """Least side of a cell of the lowest heights. Chosen by hand: half of the paper's, whose clouds are sparser."""
@@ -17,6 +21,8 @@ SLOPE = 0.15
 """Least slope, over the radius of an opening, at which what it removes is no ground."""
 TOLERANCE_M = 0.5
 """Largest height of ground above the provisional ground where that is level."""
+SMOOTHINGS = 3
+"""Averages of 3 x 3 cells over what is filled: GDAL looks in four directions, which leaves streaks. Chosen by hand."""
 SLOPE_WEIGHT = 1.25
 """Meters of tolerance for each unit of its slope."""
 
@@ -27,29 +33,30 @@ def bare_ground(heights: NDArray[np.float32], pixel_m: float, height_m: float) -
     What is higher than the ground is filled from its surroundings, up to the window; the rest stays open.
     """
     step = max(round(CELL_M / pixel_m), 1)
-    cells = _lowest(heights * np.float32(height_m), step)
-    ground = _fill(_without_objects(cells, step * pixel_m), WINDOW_M / (step * pixel_m))
-    across, down = np.gradient(ground, step * pixel_m)
-    slope = np.hypot(across, down)
-    size = heights.shape[1], heights.shape[0]
-    below, steepness = (_enlarge(picture, step, size) for picture in (ground, slope))
-    above = heights * np.float32(height_m) - below
-    is_ground = np.abs(above) <= TOLERANCE_M + SLOPE_WEIGHT * steepness
-    kept = np.where(is_ground, heights, np.float32(np.nan))
-    return np.where(np.isnan(heights), np.float32(np.nan), _fill(kept, WINDOW_M / pixel_m))
+    cell_m, size = step * pixel_m, (heights.shape[1], heights.shape[0])
+    meters = heights * np.float32(height_m)
+    lowest = _by_cells(meters, step, np.min)
+    is_object = _find_objects(lowest, cell_m)
+    ground = _fill(np.where(is_object, np.float32(np.nan), lowest), WINDOW_M / cell_m)
+    tolerance = TOLERANCE_M + SLOPE_WEIGHT * np.hypot(*np.gradient(ground, cell_m))
+    below, reach, beside = (_enlarge(picture, step, size) for picture in (ground, tolerance, is_object))
+    is_ground = (np.abs(meters - below) <= reach) & (beside == 0.0)  # also no foot of a tree
+    means = _by_cells(np.where(is_ground, meters, np.float32(np.nan)), step, np.mean)
+    filled = _enlarge(_fill(means, WINDOW_M / cell_m), step, size) / np.float32(height_m)
+    return np.where(np.isnan(heights), np.float32(np.nan), np.where(is_ground, heights, filled))
 
 
-def _lowest(heights: NDArray[np.float32], step: int) -> NDArray[np.float32]:
-    """Return the lowest height of each cell of step x step pixels; NaN in empty ones."""
+def _by_cells(heights: NDArray[np.float32], step: int, combine: Callable[..., Any]) -> NDArray[np.float32]:
+    """Return the least or the mean height of each cell of step x step pixels; NaN in empty ones."""
     rows, columns = (-(-side // step) for side in heights.shape)
-    padded = np.full((rows * step, columns * step), np.inf, np.float32)
-    padded[: heights.shape[0], : heights.shape[1]] = np.nan_to_num(heights, nan=np.inf)
-    lowest = padded.reshape(rows, step, columns, step).min(axis=(1, 3))
-    return np.where(np.isfinite(lowest), lowest, np.float32(np.nan))
+    padded = np.full((rows * step, columns * step), np.nan, np.float32)
+    padded[: heights.shape[0], : heights.shape[1]] = heights
+    cells = np.ma.masked_invalid(padded.reshape(rows, step, columns, step))
+    return np.asarray(combine(cells, axis=(1, 3)).filled(np.nan), np.float32)
 
 
-def _without_objects(cells: NDArray[np.float32], cell_m: float) -> NDArray[np.float32]:
-    """Return heights with NaN where openings of rising radius remove more than a slope would explain.
+def _find_objects(cells: NDArray[np.float32], cell_m: float) -> BoolArray:
+    """Return the cells from which openings of rising radius take more than a slope would explain.
 
     Slopes count from the plane of the whole.
     """
@@ -64,7 +71,7 @@ def _without_objects(cells: NDArray[np.float32], cell_m: float) -> NDArray[np.fl
         after = np.asarray(cv2.morphologyEx(before, cv2.MORPH_OPEN, disk), np.float32)
         is_object |= before - after > SLOPE * radius * cell_m
         before = after
-    return np.where(is_object, np.float32(np.nan), cells)
+    return is_object
 
 
 def _fill(heights: NDArray[np.float32], reach: float) -> NDArray[np.float32]:
@@ -74,12 +81,12 @@ def _fill(heights: NDArray[np.float32], reach: float) -> NDArray[np.float32]:
     known = np.isfinite(heights)
     if not known.any():
         return heights
-    filled = fillnodata(np.nan_to_num(heights), known.astype(np.uint8), max_search_distance=reach)
-    found = fillnodata(known.astype(np.float32), known.astype(np.uint8), max_search_distance=reach)
+    filled = fillnodata(np.nan_to_num(heights), known.astype(np.uint8), reach, SMOOTHINGS)
+    found = fillnodata(known.astype(np.float32), known.astype(np.uint8), reach)
     return np.where(found > 0.0, filled, np.float32(np.nan)).astype(np.float32)
 
 
-def _enlarge(cells: NDArray[np.float32], step: int, size: tuple[int, int]) -> NDArray[np.float32]:
+def _enlarge(cells: NDArray[Any], step: int, size: tuple[int, int]) -> NDArray[np.float32]:
     """Return cells as pixels (H, W) of a size (W, H), interpolated between the middles of cells."""
     whole = cells.shape[1] * step, cells.shape[0] * step
     pixels = cv2.resize(cells.astype(np.float32), whole, interpolation=cv2.INTER_LINEAR)
