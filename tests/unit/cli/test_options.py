@@ -128,7 +128,7 @@ def test_commands_choices_and_flags_are_completed(words, expected):
     ],
 )
 def test_methods_and_formats_are_completed(words, kinds):
-    maps = ["orthophoto", "dsm", "contours"] if words[0] == "export" else []
+    maps = ["orthophoto", "dsm", "dtm", "contours"] if words[0] == "export" else []
     assert completions(*words) == [name for kind in kinds for name in getattr(load_plugins(), kind)] + maps
     assert completions(*words[:-1], "no-such") == []
 
