@@ -16,11 +16,11 @@ from sfm_app.types.arrays import BoolArray
 CELL_M = 0.5
 """Least side of a cell of the lowest heights. Chosen by hand: half of the paper's, whose clouds are sparser."""
 WINDOW_M = 18.0
-"""Radius of the largest opening, which no house contains. From the paper, as are the next ones."""
+"""Radius of the largest opening, which no house contains. From the paper, as are the slope and its weight."""
 SLOPE = 0.15
 """Least slope, over the radius of an opening, at which what it removes is no ground."""
-TOLERANCE_M = 0.5
-"""Largest height of ground above the provisional ground where that is level."""
+TOLERANCE_M = 0.25
+"""Largest height of ground above the provisional ground where that is level: half of the paper's, as the cells."""
 SMOOTHINGS = 3
 """Averages of 3 x 3 cells over what is filled: GDAL looks in four directions, which leaves streaks. Chosen by hand."""
 SLOPE_WEIGHT = 1.25

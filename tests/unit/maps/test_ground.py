@@ -9,6 +9,7 @@ from sfm_app.maps.ground import bare_ground
 from sfm_app.maps.products import MapOptions, export_map
 
 PIXEL_M = 0.1
+TREES = (((45, 12), 2.0), ((20, 48), 1.2), ((8, 40), 3.0))
 
 
 def place(side_m=60.0):
@@ -23,23 +24,27 @@ def with_things(x, y, ground):
     for left, top, wide, deep, tall in ((10, 8, 8, 12, 4), (30, 35, 14, 9, 6), (50, 50, 14, 14, 3)):
         inside = (x > left) & (x < left + wide) & (y > top) & (y < top + deep)
         heights[inside], things = ground[inside].max() + tall, things | inside
-    for at, radius in (((45, 12), 2.0), ((20, 48), 1.2), ((8, 40), 3.0)):
+    for at, radius in TREES:
         away = np.hypot(x - at[0], y - at[1])
-        dome = ground + np.sqrt(np.maximum(radius**2 - away**2, 0.0)) + 1.0
+        dome = ground + np.sqrt(np.maximum(radius**2 - away**2, 0.0))
         inside = away < radius
         heights[inside], things = dome[inside], things | inside
     return heights, things
 
 
-def test_houses_and_trees_go_and_hills_stay():
+@pytest.mark.parametrize("height_m", [1.0, 0.3048])
+def test_houses_and_trees_go_and_hills_stay_in_any_unit(height_m):
     x, y, ground = place()
+    ground = ground + np.random.default_rng(0).normal(scale=0.01, size=ground.shape).astype(np.float32)
     heights, things = with_things(x, y, ground)
-    found = bare_ground(heights, PIXEL_M, 1.0)
-    error = np.abs(found - ground)
-    assert np.abs(heights - ground)[things].min() > 0.9
-    assert np.isfinite(found).all() and np.array_equal(found[~things & (error == 0)], ground[~things & (error == 0)])
-    assert np.mean(error[~things] == 0.0) > 0.98  # the surface itself
-    assert 0.01 < np.quantile(error[things], 0.9) < 0.5 and np.median(error[things]) < 0.15
+    found = bare_ground(heights / np.float32(height_m), PIXEL_M, height_m) * height_m
+    error = found - ground
+    assert np.median(np.abs(heights - ground)[things]) > 3.0 and np.isfinite(found).all()
+    assert np.mean(np.abs(error[~things]) < 1e-5) > 0.98  # the surface itself
+    trees = np.min([np.hypot(x - at[0], y - at[1]) / radius for at, radius in TREES], axis=0) < 1.0
+    assert 0.001 < np.quantile(np.abs(error[trees]), 0.99) < 0.2  # their feet go, too
+    assert 0.01 < np.quantile(np.abs(error[things]), 0.9) < 0.5
+    assert abs(np.median(error[things])) < 0.05
 
 
 @pytest.mark.parametrize("height_m", [1.0, 0.3048])
