@@ -162,6 +162,19 @@ def scale_lines(counts: Mapping[str, Any]) -> Iterator[str]:
         yield "size        unknown: measure it in the report, or use --markers or --gcp"
     if counts.get("level"):
         yield "            upright by the level surfaces that you have given"
+    checks = counts.get("check_points")
+    if checks:
+        inside, outside = checks["inside"], checks["outside"]
+        plan, height = (format_length(checks[key]) for key in ("plan_rms_m", "height_rms_m"))
+        yield (
+            f"            {len(inside)} of {len(inside) + len(outside)} check points lie inside three of their "
+            f"deviations: off by {plan} in plan and {height} in height"
+        )
+        if outside:
+            yield (
+                f"            beware: off by more than their deviations explain: {list_names(outside, NAMES_SHOWN)}. "
+                "Compare their marks and the survey"
+            )
     for text in (*counts["contradictions"], *counts["problems"]):
         yield f"            beware: {text}"
 
