@@ -8,6 +8,7 @@ from typing import Any
 from sfm_app.camera.bearings import field_of_view_deg
 from sfm_app.camera.models import calibration_from_model
 from sfm_app.frame.sighted_points import Distance
+from sfm_app.frame.volumes import Volume
 from sfm_app.settings import FIRST_TRIAL, HYPOTHESES
 from sfm_app.types import Calibration, CameraModel, Intrinsics, Scene
 from sfm_app.types.camera import CLAIM, EQUIRECTANGULAR, FISHEYE, GIVEN, KEPT
@@ -187,6 +188,22 @@ def distance_text(distance: Distance) -> str:
             "--markers or --gcp gives meters"
         )
     return f"{format_length(distance.value)} +- {format_length(distance.deviation)}"
+
+
+def volume_lines(volume: Volume) -> Iterator[str]:
+    """Yield volumes with their deviations, and what they stand on."""
+    cube, square = ("m3", "m2") if volume.metric else ("", "")
+    for name, value, deviation in (
+        ("above the plane (cut)", volume.cut, volume.cut_deviation),
+        ("below the plane (fill)", volume.fill, volume.fill_deviation),
+        ("above less below (net)", volume.net, volume.net_deviation),
+    ):
+        yield f"{name:<24}{value:.4g} +- {deviation:.2g} {cube}".rstrip()
+    yield f"{'area':<24}{volume.area:.4g} {square}".rstrip()
+    if volume.missing > 0:
+        yield f"beware: {100 * volume.missing:.2g} % of the area has no surface: the heights beside it stand for it there"
+    if not volume.metric:
+        yield "in the model's own unit; `sfm-app run` with --scale, --markers or --gcp gives meters"
 
 
 # A whole run.

@@ -8,16 +8,7 @@ import numpy as np
 from sfm_app.colmap.model import sparse_model
 from sfm_app.frame import known_lengths
 from sfm_app.frame.control_points import ControlFit, find_mistake, fit_control_points
-from sfm_app.frame.scale import (
-    CHECK,
-    GPS,
-    MetricFrame,
-    ScaleEvidence,
-    SurveyedPoint,
-    agree,
-    move_model,
-    stand_upright,
-)
+from sfm_app.frame.scale import CHECK, GPS, MetricFrame, ScaleEvidence, SurveyedPoint, agree, move_model, stand_upright
 from sfm_app.frame.sighted_points import PosedPhotos
 from sfm_app.numerical import Json
 from sfm_app.products import write_frame
