@@ -102,7 +102,8 @@ def measure_volume(corners: FloatArray, surface: Surface, model: Sightlines, dev
         )
         values.append(value)
         deviations.append(float(np.sqrt(variance)))
-    return Volume(values[0], values[1], *deviations, area, missing, deviation is not None)
+    (cut, fill, _), (of_cut, of_fill, of_net) = values, deviations
+    return Volume(cut, fill, of_cut, of_fill, of_net, area, missing, deviation is not None)
 
 
 class _Errors:

@@ -201,7 +201,7 @@ def volume_lines(volume: Volume) -> Iterator[str]:
         yield f"{name:<24}{value:.4g} +- {deviation:.2g} {cube}".rstrip()
     yield f"{'area':<24}{volume.area:.4g} {square}".rstrip()
     if volume.missing > 0:
-        yield f"beware: {100 * volume.missing:.2g} % of the area has no surface: the heights beside it stand for it there"
+        yield f"beware: {100 * volume.missing:.2g} % of the area has no surface: the heights beside it count there"
     if not volume.metric:
         yield "in the model's own unit; `sfm-app run` with --scale, --markers or --gcp gives meters"
 

@@ -203,7 +203,7 @@ def test_the_deviation_of_check_points_covers_their_error(count, noise_m, mark_m
 def test_a_check_point_has_no_part_in_the_fit():
     given, located, places = survey(np.random.default_rng(8), 7)
     alone = fit_control_points(replace(given, points=given.points[:6]), located)
-    moved = TRUE(places[6]) + [0.3, -0.4, 0.0]
+    moved = TRUE(places[6]) + np.array([0.3, -0.4, 0.0])
     (enu,) = LocalFrame(read_system("EPSG:32632"), UTM).positions(np.array([[moved[0], -moved[2], moved[1]]]))
     checked = replace(given.points[6], name="chk-far", position=tuple(enu.tolist()))
     found = fit_control_points(
