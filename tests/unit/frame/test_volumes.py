@@ -1,5 +1,7 @@
 """Volumes of heaps and pits of known shape: values, and deviations that cover the error and are not much too wide."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -93,13 +95,30 @@ def test_the_deviation_covers_the_errors_of_surface_and_corners_and_size():
     rng, model, normalized = np.random.default_rng(1), flight(), []
     for _ in range(40):
         covariance = place_covariance(np.zeros(3), model)
-        sigma, size = np.sqrt(covariance[1, 1]), np.exp(0.01 * rng.normal())
+        sigma, size = np.sqrt(covariance[1, 1]), np.exp(0.002 * rng.normal())
         shift = sigma * rng.normal()
         corners = SQUARE + rng.multivariate_normal(np.zeros(3), covariance, size=4)
         shape = ground(lambda x, z, shift=shift: cone(x, z) + 0.05 + shift, cells=40)
-        found = measure_volume(size * corners, Surface(size * shape.vertices, shape.faces, shape.colors), model, 0.01)
+        found = measure_volume(size * corners, Surface(size * shape.vertices, shape.faces, shape.colors), model, 0.002)
         normalized.append((found.net - (CONE + 16 * 0.05)) / found.net_deviation)
     assert 0.5 < np.sqrt(np.mean(np.square(normalized))) < 1.3
+
+
+def test_the_unit_widens_the_deviation_by_three_times_its_own():
+    sure, unsure = (measure_volume(SQUARE, ground(cone, cells=40), flight(), one) for one in (0.0, 0.05))
+    assert np.hypot(sure.cut_deviation, 0.15 * sure.cut) == pytest.approx(unsure.cut_deviation)
+
+
+def test_where_a_heap_stands_across_the_edge_the_places_of_corners_count():
+    model, rng = flight(), np.random.default_rng(2)
+    model = replace(model, centers=10 * model.centers)  # the height of the heap hardly changes its distance
+    flat, mesa = (measure_volume(SQUARE, ground(lambda x, _, h=h: h + 0 * x, cells=10), model, 0.0) for h in (0.0, 3.0))
+    aside = np.sqrt(np.diag(place_covariance(SQUARE[0], model)))[[0, 2]]
+    moved = SQUARE[:, [0, 2]] + aside * rng.normal(size=(400, 4, 2))
+    x, y = np.moveaxis(moved, -1, 0)
+    areas = np.abs((x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1)) / 2
+    edge = np.sqrt(mesa.net_deviation**2 - flat.net_deviation**2)
+    assert 0.9 < edge / (3.0 * np.std(areas)) < 2.0
 
 
 @pytest.mark.parametrize(
