@@ -8,6 +8,7 @@ sfm_app.export_model("out/", "obj")
 sfm_app.export_scene("out/", "colmap")
 sfm_app.write_report("out/")
 sfm_app.measure_distance("out/", (0, 0, 0), (1, 0, 0))
+sfm_app.measure_volume("out/", [(0, 0, 0), (1, 0, 0), (1, 0, 1)])
 sfm_app.view_run("out/")
 fit = sfm_app.estimate_fundamental(x1, x2)
 cal = sfm_app.calibrate_fundamentals(Fs, (width, height))
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
         export_model,
         export_scene,
         measure_distance,
+        measure_volume,
         read_run,
         reconstruct,
         view_run,
@@ -64,6 +66,7 @@ __all__ = [
     "export_model",
     "export_scene",
     "measure_distance",
+    "measure_volume",
     "read_run",
     "reconstruct",
     "view_run",

@@ -29,6 +29,7 @@ from sfm_app.types.arrays import FloatArray
 if TYPE_CHECKING:
     from sfm_app.engine.stage import Products
     from sfm_app.frame.sighted_points import Distance
+    from sfm_app.frame.volumes import Volume
 
 PathLike = str | os.PathLike[str]
 
@@ -429,6 +430,33 @@ def measure_distance(out: PathLike, a: ArrayLike, b: ArrayLike) -> "Distance":
         raise ValueError("each place is three finite numbers")
     with open_run(Path(out), Settings(), None) as run:
         return stored_distance(run, ends)
+
+
+def measure_volume(out: PathLike, polygon: ArrayLike) -> "Volume":
+    """Return the volumes above and below a plane within a polygon of a finished run, with standard deviations.
+
+    The plane is the best one through the corners. The surface counts as the cameras see it along the plane's normal.
+
+    Args:
+        polygon: (N, 3) corners in order, x, y, z in the frame of its exported files, such as OUT/model.glb.
+
+    Raises:
+        ValueError: the corners are not finite or make no polygon, or there is no surface in it.
+        InputError: the run has no surface yet.
+
+    Examples:
+        >>> import sfm_app
+        >>> heap = sfm_app.measure_volume("out", [(0, 0, 0), (1, 0, 0), (1, 0, 1)])  # doctest: +SKIP
+        >>> heap.cut, heap.cut_deviation  # doctest: +SKIP
+        (0.031, 0.002)
+    """
+    from sfm_app.exports import stored_volume  # loads COLMAP
+
+    corners = np.array(polygon, np.float64)
+    if corners.ndim != 2 or corners.shape[1] != 3 or not np.isfinite(corners).all():
+        raise ValueError("each corner is three finite numbers")
+    with open_run(Path(out), Settings(), None) as run:
+        return stored_volume(run, corners)
 
 
 # The estimators alone, on matches and on fundamental matrices.

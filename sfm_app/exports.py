@@ -34,6 +34,7 @@ from sfm_app.formats.scenes import plain_names
 from sfm_app.frame.coordinates import MapFrame
 from sfm_app.frame.scale import GPS, MetricFrame, map_entry, move_model
 from sfm_app.frame.sighted_points import Distance, PosedPhotos, measure_distance
+from sfm_app.frame.volumes import Volume, measure_volume
 from sfm_app.geometry.poses import Similarity
 from sfm_app.geometry.triangles import select_faces
 from sfm_app.numerical import json_text
@@ -149,6 +150,18 @@ def stored_distance(run: RunContext, ends: FloatArray) -> Distance:
     with check_undamaged(SCENE, run):
         model = PosedPhotos(run.workspace.sparse).sightlines()
     return measure_distance(a, b, model, frame.from_model.scale, frame.deviation)
+
+
+def stored_volume(run: RunContext, corners: FloatArray) -> Volume:
+    """Return the volumes within a polygon, (N, 3) in the frame of exports; ValueError as in `measure_volume`."""
+    check_finished(run, [SCENE, MESH], "surface")
+    frame = stored_frame(run)
+    with check_undamaged(SCENE, run):
+        model = PosedPhotos(run.workspace.sparse).sightlines()
+    surface = Products(run)[MESH]
+    move = frame.from_model
+    model = replace(model, centers=move(model.centers), points=move(model.points))
+    return measure_volume(corners, replace(surface, vertices=move(surface.vertices)), model, frame.deviation)
 
 
 def check_cloud(run: RunContext) -> Path:

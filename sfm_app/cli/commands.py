@@ -357,21 +357,30 @@ def choose_format(name: str, target: Path | None) -> str:
 
 @click.command(context_settings={"ignore_unknown_options": True})  # coordinates may begin with a minus
 @click.argument("out", type=PATH)
-@click.argument("a")
-@click.argument("b")
+@click.argument("a", required=False)
+@click.argument("b", required=False)
+@click.option("--volume", "polygon", metavar="POLYGON", help="Corners in order around a heap or pit, in quotes.")
 @json_option
-def measure(out: Path, a: str, b: str, as_json: bool) -> None:
-    """Print the distance between the points A and B, with its standard deviation.
+def measure(out: Path, a: str | None, b: str | None, polygon: str | None, as_json: bool) -> None:
+    """Print the distance between the points A and B, or the volume in a polygon, with standard deviations.
 
-    A point is x,y,z in the coordinates of OUT/model.glb.
+    A point is x,y,z in the coordinates of OUT/model.glb. The volume is above and below the plane through the corners.
     """
-    from sfm_app.report.text import distance_text
+    from sfm_app.report.text import distance_text, volume_lines
 
+    hint = 'sfm-app measure OUT 0.1,0.2,0.3 1,0,-0.5, or sfm-app measure OUT --volume "0,0,0 1,0,0 1,0,-1"'
+    if (polygon is None) != (b is not None) or (polygon is not None and a is not None):
+        raise ConfigError("name two points, or the corners of a polygon", hint=hint)
     try:
-        distance = sfm_app.measure_distance(out, parse_point(a), parse_point(b))
+        if polygon is None:
+            distance = sfm_app.measure_distance(out, parse_point(a or ""), parse_point(b or ""))
+            values, lines = distance.to_dict(), [distance_text(distance)]
+        else:
+            volume = sfm_app.measure_volume(out, [parse_point(corner) for corner in polygon.split()])
+            values, lines = volume.to_dict(), list(volume_lines(volume))
     except ValueError as err:
-        raise ConfigError(str(err), hint="sfm-app measure OUT 0.1,0.2,0.3 1,0,-0.5") from None
-    print_json(distance.to_dict()) if as_json else print_text([distance_text(distance)])
+        raise ConfigError(str(err), hint=hint) from None
+    print_json(values) if as_json else print_text(lines)
 
 
 @click.command()

@@ -36,7 +36,7 @@ SECTIONS: Mapping[str, Mapping[str, str]] = MappingProxyType({
         "view": "Show the model in the browser.",
         "report": "Write the report again, or compare two runs.",
         "export": "Export the model or its cameras for other programs.",
-        "measure": "Measure a distance in the model.",
+        "measure": "Measure a distance or a volume in the model.",
     },
     "Check and configure": {
         "doctor": "Check this machine and the installed libraries.",

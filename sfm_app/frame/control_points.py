@@ -15,6 +15,7 @@ import numpy as np
 from sfm_app.errors import InputError
 from sfm_app.files import fingerprint, read_text
 from sfm_app.frame.coordinates import GPS_SYSTEM, CoordinateSystem, LocalFrame, read_system
+from sfm_app.frame.scale import CHECK, LEFT_OUT, USED, SurveyedPoint
 from sfm_app.frame.sighted_points import SightedPoint
 from sfm_app.geometry.poses import Similarity, robust_similarity, umeyama
 from sfm_app.numerical import FAILURES
@@ -25,7 +26,8 @@ from sfm_app.wording import format_length
 # The file, OpenDroneMap's gcp_list.txt.
 # The first line is the coordinate system: EPSG:32632, a proj string such as "+proj=utm +zone=32 +datum=WGS84", or
 # "WGS84 UTM 32N". Each other line is a mark in a photo: geo_x geo_y geo_z pixel_x pixel_y photo [name]. Marks with
-# the same name, or without names at the same position, belong to one point.
+# the same name, or without names at the same position, belong to one point. A name that begins with CHK- makes a check
+# point: it has no part in the fit.
 
 FORM = (
     "the first line is a coordinate system such as EPSG:32632, or `local` for meters along your own axes; each other "
@@ -187,13 +189,21 @@ class ControlFit:
     outliers: Mapping[str, float]
     """Distance of each rejected point from the fit, in meters."""
     place: MapPlace
+    surveyed: tuple[SurveyedPoint, ...] = ()
+    """All located points, check points included."""
 
 
-def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]) -> ControlFit | str:
-    """Fit the similarity from the model to control points by their places in it; return the reason if there is none."""
-    points = [point for point in given.points if point.name in located]
+def fit_control_points(
+    given: ControlPoints, located: Mapping[str, SightedPoint], shape: float = 0.0
+) -> ControlFit | str:
+    """Fit the similarity from the model to control points by their places in it; return the reason if there is none.
+
+    Check points have no part in the fit. `shape` is the relative deviation of the model's proportions.
+    """
+    used_for_fit = [point for point in given.points if not point.is_check]
+    points = [point for point in used_for_fit if point.name in located]
     if len(points) < 3:
-        return f"{len(points)} of {len(given.points)} ground control points have a place in the model, 3 are needed"
+        return f"{len(points)} of {len(used_for_fit)} ground control points have a place in the model, 3 are needed"
     sights = [located[point.name] for point in points]
     placed = _place(read_system(given.crs), np.array([point.position for point in points]), sights)
     if placed is None:
@@ -205,7 +215,50 @@ def fit_control_points(given: ControlPoints, located: Mapping[str, SightedPoint]
     marks = fit.scale * _mark_deviation([located[name] for name in inliers])
     deviation = max(_sigma(distances[used]), marks, MIN_SIGMA_M) / float(np.sqrt(used.sum())) / placed.spread(used)
     x, y, z = frame.origin.tolist()
-    return ControlFit(fit, deviation, placed.miss(used), inliers, outliers, MapPlace(given.crs, (x, y, z)))
+    surveyed = tuple(
+        _compare(point, located[point.name], placed, shape, USED if point.name in inliers else LEFT_OUT)
+        for point in given.points
+        if point.name in located
+    )
+    return ControlFit(fit, deviation, placed.miss(used), inliers, outliers, MapPlace(given.crs, (x, y, z)), surveyed)
+
+
+def _compare(point: ControlPoint, sight: SightedPoint, placed: "_Placed", shape: float, role: str) -> SurveyedPoint:
+    """Return how far a located point is off, and for a check point, how far it may be."""
+    target = placed.frame(np.array([point.position]))[0] @ EAST_UP_SOUTH.T
+    x, y, z = placed.fit(sight.place) - target
+    residuals = float(np.hypot(x, z)), float(y)
+    if not point.is_check:
+        return SurveyedPoint(point.name, role, len(sight.photos), *residuals)
+    variance = np.diag(_prediction_covariance(target, sight, placed, shape))
+    deviations = float(np.sqrt(variance[0] + variance[2])), float(np.sqrt(variance[1]))
+    return SurveyedPoint(point.name, CHECK, len(sight.photos), *residuals, *deviations)
+
+
+def _prediction_covariance(target: FloatArray, sight: SightedPoint, placed: "_Placed", shape: float) -> FloatArray:
+    """Return the covariance (3, 3) in m^2 of the residual of a point that has no part in the fit.
+
+    It adds the point's marks, which are no better than those of the fit; what the residuals of the fit have beyond
+    their marks, which is the survey and the model; the seven parameters of the fit; and the camera, since a wrong focal
+    bends depths against widths.
+    """
+    fitted = [one for one, used in zip(placed.sights, placed.used, strict=True) if used]
+    marks_m, typical_px = placed.fit.scale * _mark_deviation(fitted), np.median([one.sigma_px for one in fitted])
+    sigma = max(_sigma(placed.distances[placed.used]), marks_m, MIN_SIGMA_M)
+    others = max(sigma**2 - marks_m**2, MIN_SIGMA_M**2)
+    middle = placed.targets[placed.used].mean(axis=0)
+    jacobians = [_similarity_jacobian(one - middle) for one in placed.targets[placed.used]]
+    parameters = np.linalg.inv(sum(one.T @ one for one in jacobians))
+    here, turn = _similarity_jacobian(target - middle), placed.fit.scale * placed.fit.R
+    marks = max(typical_px / sight.sigma_px, 1.0) ** 2 * sight.covariance
+    bent = shape * (target - middle)
+    covariance = turn @ marks @ turn.T + others * np.eye(3) + sigma**2 * here @ parameters @ here.T
+    return np.asarray(covariance + np.outer(bent, bent))
+
+
+def _similarity_jacobian(place: FloatArray) -> FloatArray:
+    """Return the derivatives (3, 7) of a place (3,) by translation, rotation and scale."""
+    return np.column_stack([np.eye(3), np.cross(np.eye(3), place), place])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,6 +272,7 @@ class _Placed:
     fit: Similarity
     distances: FloatArray
     """(N,) from the targets, in meters."""
+    sights: Sequence[SightedPoint]
 
     def miss(self, rows: BoolArray | slice = slice(None)) -> float:
         """Return the root mean square of distances."""
@@ -239,7 +293,7 @@ def _place(system: CoordinateSystem, positions: FloatArray, sights: Sequence[Sig
     except FAILURES:
         return None
     fit = umeyama(places[used], targets[used])
-    return _Placed(frame, targets, used, fit, np.linalg.norm(fit(places) - targets, axis=1))
+    return _Placed(frame, targets, used, fit, np.linalg.norm(fit(places) - targets, axis=1), sights)
 
 
 def _mark_deviation(sights: Sequence[SightedPoint]) -> float:
@@ -326,7 +380,7 @@ def find_mistake(
 
     Each plausible mistake is corrected, and the misses are compared. `gps` has the positions of the photos.
     """
-    points = [point for point in given.points if point.name in located]
+    points = [point for point in given.points if point.name in located and not point.is_check]
     sights = [located[point.name] for point in points]
     system, positions = read_system(given.crs), np.array([point.position for point in points])
     now = _place(system, positions, sights)

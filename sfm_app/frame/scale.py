@@ -30,6 +30,36 @@ class ScaleEvidence:
     photos: int = 0
 
 
+USED, LEFT_OUT, CHECK = "used", "left out", "check"
+INSIDE = 3.0
+"""Standard deviations within which a check point agrees. By definition: the usual bound."""
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyedPoint:
+    """A ground control point, and how far its place in the model is off."""
+
+    name: str
+    role: str
+    """USED or LEFT_OUT in the fit of the frame, or CHECK."""
+    photos: int
+    """How many photos determine the place."""
+    plan_m: float
+    """Horizontal distance from the surveyed position to the place in the model."""
+    height_m: float
+    """Height of the place above the surveyed position."""
+    plan_deviation_m: float | None = None
+    """Standard deviation of both horizontal coordinates together, None unless the point checks."""
+    height_deviation_m: float | None = None
+
+    @property
+    def is_inside(self) -> bool | None:
+        """Whether both residuals lie inside three deviations; None unless the point checks."""
+        if self.plan_deviation_m is None or self.height_deviation_m is None:
+            return None
+        return self.plan_m <= INSIDE * self.plan_deviation_m and abs(self.height_m) <= INSIDE * self.height_deviation_m
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MetricFrame:
     """A similarity from the frame of OUT/sparse into that of all exported files, y up in both."""
@@ -44,6 +74,8 @@ class MetricFrame:
     """Evidence that contradicts the rest, one sentence each."""
     place: MapPlace | None = None
     """Place of the frame, by ground control points or else GPS."""
+    surveyed: tuple[SurveyedPoint, ...] = ()
+    """Ground control points and check points, in the order of their file."""
 
     @property
     def is_metric(self) -> bool:
@@ -75,6 +107,7 @@ class MetricFrame:
             tuple(ScaleEvidence(**one) for one in values["evidence"]),
             tuple(values["contradictions"]),
             read_place(values["place"]),
+            tuple(SurveyedPoint(**one) for one in values.get("surveyed", ())),
         )
 
 

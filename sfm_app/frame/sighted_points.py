@@ -60,6 +60,8 @@ class SightedPoint:
     photos: tuple[str, ...]
     outliers: tuple[str, ...]
     """Photos whose mark contradicts the others."""
+    sigma_px: float = 1.0
+    """Standard deviation of a mark that the covariance assumes: two photos may agree by chance."""
 
 
 def locate_point(sights: Sequence[Sight]) -> SightedPoint | str:
@@ -86,6 +88,7 @@ def locate_point(sights: Sequence[Sight]) -> SightedPoint | str:
         np.asarray(sigma**2 * np.linalg.inv(information), np.float64),
         tuple(one.photo for one, inlier in zip(sights, inliers, strict=True) if inlier),
         tuple(one.photo for one, inlier in zip(sights, inliers, strict=True) if not inlier),
+        sigma,
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from sfm_app.camera.models import PARAMETERS
 from sfm_app.colmap.model import ModelFigures
+from sfm_app.frame.scale import SurveyedPoint
 from sfm_app.photos.decode import small_jpeg
 from sfm_app.report.contents import RunContents, data_address
 from sfm_app.report.text import REMEDY, SOURCES, WARNING, duration_text, intrinsics_lines, result_lines
@@ -190,6 +191,22 @@ def camera_tables(contents: RunContents) -> list[CameraTable]:
         size = f"{camera.width} × {camera.height}"
         tables.append(CameraTable(name, size, lens, rows, texts, correlation_table(camera, after)))
     return tables
+
+
+def survey_rows(surveyed: Sequence[SurveyedPoint]) -> list[tuple[str, ...]]:
+    """Return name, use, photos, plan and height of each ground control point and check point, in mm with deviations."""
+    return [
+        (
+            one.name,
+            one.role if one.is_inside is None else f"{one.role}, {'inside' if one.is_inside else 'outside'}",
+            str(one.photos),
+            *(
+                value_text(1e3 * value, None if deviation is None else 1e3 * deviation)
+                for value, deviation in ((one.plan_m, one.plan_deviation_m), (one.height_m, one.height_deviation_m))
+            ),
+        )
+        for one in surveyed
+    ]
 
 
 def _lens_rows(after: CameraModel) -> list[tuple[str, str, str]]:

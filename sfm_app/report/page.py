@@ -127,6 +127,7 @@ def render_page(contents: RunContents, parts: LargeParts, other: RunContents | N
         warnings=warnings,
         remarks=others,
         cameras=findings.camera_tables(contents),
+        surveyed=findings.survey_rows(contents.frame.surveyed),
         dropped=findings.dropped_pairs(contents),
         rows=rows,
         stages=contents.stages,

@@ -8,6 +8,7 @@ from typing import Any
 from sfm_app.camera.bearings import field_of_view_deg
 from sfm_app.camera.models import calibration_from_model
 from sfm_app.frame.sighted_points import Distance
+from sfm_app.frame.volumes import Volume
 from sfm_app.settings import FIRST_TRIAL, HYPOTHESES
 from sfm_app.types import Calibration, CameraModel, Intrinsics, Scene
 from sfm_app.types.camera import CLAIM, EQUIRECTANGULAR, FISHEYE, GIVEN, KEPT
@@ -162,6 +163,19 @@ def scale_lines(counts: Mapping[str, Any]) -> Iterator[str]:
         yield "size        unknown: measure it in the report, or use --markers or --gcp"
     if counts.get("level"):
         yield "            upright by the level surfaces that you have given"
+    checks = counts.get("check_points")
+    if checks:
+        inside, outside = checks["inside"], checks["outside"]
+        plan, height = (format_length(checks[key]) for key in ("plan_rms_m", "height_rms_m"))
+        yield (
+            f"            {len(inside)} of {len(inside) + len(outside)} check points lie inside three of their "
+            f"deviations: off by {plan} in plan and {height} in height"
+        )
+        if outside:
+            yield (
+                f"            beware: off by more than their deviations explain: {list_names(outside, NAMES_SHOWN)}. "
+                "Compare their marks and the survey"
+            )
     for text in (*counts["contradictions"], *counts["problems"]):
         yield f"            beware: {text}"
 
@@ -174,6 +188,22 @@ def distance_text(distance: Distance) -> str:
             "--markers or --gcp gives meters"
         )
     return f"{format_length(distance.value)} +- {format_length(distance.deviation)}"
+
+
+def volume_lines(volume: Volume) -> Iterator[str]:
+    """Yield volumes with their deviations, and what they stand on."""
+    cube, square = ("m3", "m2") if volume.metric else ("", "")
+    for name, value, deviation in (
+        ("above the plane (cut)", volume.cut, volume.cut_deviation),
+        ("below the plane (fill)", volume.fill, volume.fill_deviation),
+        ("above less below (net)", volume.net, volume.net_deviation),
+    ):
+        yield f"{name:<24}{value:.4g} +- {deviation:.2g} {cube}".rstrip()
+    yield f"{'area':<24}{volume.area:.4g} {square}".rstrip()
+    if volume.missing > 0:
+        yield f"beware: {100 * volume.missing:.2g} % of the area has no surface: the heights beside it count there"
+    if not volume.metric:
+        yield "in the model's own unit; `sfm-app run` with --scale, --markers or --gcp gives meters"
 
 
 # A whole run.

@@ -8,8 +8,9 @@ import numpy as np
 from sfm_app.colmap.model import sparse_model
 from sfm_app.frame import known_lengths
 from sfm_app.frame.control_points import ControlFit, find_mistake, fit_control_points
-from sfm_app.frame.scale import GPS, MetricFrame, ScaleEvidence, agree, move_model, stand_upright
+from sfm_app.frame.scale import CHECK, GPS, MetricFrame, ScaleEvidence, SurveyedPoint, agree, move_model, stand_upright
 from sfm_app.frame.sighted_points import PosedPhotos
+from sfm_app.numerical import Json
 from sfm_app.products import write_frame
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import PhotoSet, Scene
@@ -27,6 +28,9 @@ def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
     options, evidence, problems = run.settings.scale, list[ScaleEvidence](), list[str]()
     if scene.gps_deviation is not None:
         evidence.append(ScaleEvidence(GPS, 1.0, max(scene.gps_deviation, 1e-4), len(scene.registered)))
+    # the proportions are as exact as the least exact focal length
+    shares = (one.deviations.get("fx", 0.0) / one.K[0, 0] for one in scene.cameras.values())
+    shape = float(max((share for share in shares if np.isfinite(share)), default=0.0))
     control: ControlFit | None = None
     if options.distances or options.markers or run.control_points:
         posed = PosedPhotos(scene.model_dir)
@@ -35,10 +39,7 @@ def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
         if options.markers:
             evidence += known_lengths.marker_evidence(posed, run, problems)
         if run.control_points:
-            control = _control_evidence(photos, posed, run, evidence, problems)
-    # the proportions are as exact as the least exact focal length
-    shares = (one.deviations.get("fx", 0.0) / one.K[0, 0] for one in scene.cameras.values())
-    shape = float(max((share for share in shares if np.isfinite(share)), default=0.0))
+            control = _control_evidence(photos, posed, shape, run, evidence, problems)
     frame = _agreed_frame(evidence, control, shape)
     frame = frame if control else replace(frame, place=scene.gps_place)
     if options.level and frame.place is not None:
@@ -70,9 +71,17 @@ def make(photos: PhotoSet, scene: Scene, run: RunContext) -> MetricFrame:
 
 
 def _control_evidence(
-    photos: PhotoSet, posed: PosedPhotos, run: RunContext, evidence: list[ScaleEvidence], problems: list[str]
+    photos: PhotoSet,
+    posed: PosedPhotos,
+    shape: float,
+    run: RunContext,
+    evidence: list[ScaleEvidence],
+    problems: list[str],
 ) -> ControlFit | None:
-    """Return the fit to ground control points, and add to the evidence and the problems."""
+    """Return the fit to ground control points, and add to the evidence and the problems.
+
+    `shape` is the relative deviation of the model's proportions.
+    """
     given = run.control_points
     if known_lengths.is_normalized(given):
         given = known_lengths.marks_in_pixels(photos, given)
@@ -81,7 +90,7 @@ def _control_evidence(
         problems.append(f"all marks lie between 0 and 1, as shares of width and height ({reason}): write pixels")
         return None
     located = known_lengths.control_places(photos, posed, given, problems)
-    fit = fit_control_points(given, located)
+    fit = fit_control_points(given, located, shape)
     if isinstance(fit, str):
         problems.append(fit)
         return None
@@ -94,8 +103,18 @@ def _control_evidence(
         problems.append(f"ground control point '{name}' contradicts the others: it is {miss:.3g} m off, and left out")
     evidence.append(ScaleEvidence(f"{len(fit.inliers)} ground control points", fit.from_model.scale, fit.deviation))
     used = {"used": list(fit.inliers), "wrong": dict(fit.outliers), "rms_m": fit.rms_m}
-    run.record(control_points={"system": fit.place.system, **used})
+    run.record(control_points={"system": fit.place.system, **used}, **_check_figures(fit.surveyed))
     return fit
+
+
+def _check_figures(surveyed: Sequence[SurveyedPoint]) -> dict[str, Json]:
+    """Return the check points that agree, those that do not, and their root mean squares; empty without any."""
+    checks = [one for one in surveyed if one.role == CHECK]
+    if not checks:
+        return {}
+    inside, outside = ([one.name for one in checks if one.is_inside is which] for which in (True, False))
+    plan, height = np.sqrt(np.mean([[one.plan_m**2, one.height_m**2] for one in checks], axis=0)).tolist()
+    return {"check_points": {"inside": inside, "outside": outside, "plan_rms_m": plan, "height_rms_m": height}}
 
 
 def _agreed_frame(evidence: Sequence[ScaleEvidence], control: ControlFit | None, shape: float) -> MetricFrame:
@@ -109,4 +128,5 @@ def _agreed_frame(evidence: Sequence[ScaleEvidence], control: ControlFit | None,
         from_model=control.from_model,
         deviation=max(float(np.hypot(control.deviation, shape)), difference),
         place=control.place,
+        surveyed=control.surveyed,
     )

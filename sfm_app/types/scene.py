@@ -157,6 +157,11 @@ class ControlPoint:
     marks: Mapping[str, tuple[float, float]]
     """By photo: x and y in pixels of the upright photo at its full size; pixel centers at +0.5."""
 
+    @property
+    def is_check(self) -> bool:
+        """Whether the point only checks the model: its name begins with CHK-, as for OpenDroneMap."""
+        return self.name.casefold().startswith("chk-")
+
 
 @dataclass(frozen=True, slots=True)
 class ControlPoints:

@@ -173,6 +173,29 @@ def test_a_wrong_control_point_is_named_and_left_out(measured, tmp_path):
     assert_scale(read_scale(measured.out), true_similarity(measured).scale, within=0.005)
 
 
+def test_check_points_lie_inside_their_deviations(measured, tmp_path):
+    path = marks_file(measured, tmp_path / "gcp_list.txt", GROUND)
+    text = path.read_text(encoding="utf-8").replace(" p4\n", " CHK-4\n").replace(" p5\n", " chk-5\n")
+    path.write_text(text, encoding="utf-8")
+    run = again(measured, control_points=str(path))
+    counts = run.manifest["stages"]["scale"]["counts"]
+    assert counts["control_points"]["used"] == ["p0", "p1", "p2", "p3"]
+    assert counts["check_points"]["inside"] == ["CHK-4", "chk-5"] and not counts["check_points"]["outside"]
+    checks = [one for one in read_scale(measured.out)["surveyed"] if one["role"] == "check"]
+    for one in checks:
+        assert 0.0 < one["plan_m"] < 0.03 and one["plan_deviation_m"] < 0.1 and one["photos"] >= 2
+    (moved := tmp_path / "moved.txt").write_text(  # a check point whose height is wrong
+        "\n".join(_raise(line, 1.0) if line.endswith("CHK-4") else line for line in text.splitlines())
+    )
+    outside = again(measured, control_points=str(moved)).manifest["stages"]["scale"]["counts"]["check_points"]
+    assert outside["outside"] == ["CHK-4"] and outside["height_rms_m"] == pytest.approx(np.sqrt(0.5), abs=0.05)
+
+
+def _raise(line, by_m):
+    x, y, z, *rest = line.split()
+    return " ".join([x, y, f"{float(z) + by_m}", *rest])
+
+
 def test_control_points_in_feet_give_the_same_size(measured, tmp_path):
     lines = marks_file(measured, tmp_path / "meters.txt", GROUND[:5]).read_text().splitlines()
     feet = LocalFrame(read_system("EPSG:2263"), np.array([980_000.0, 200_000.0, 100.0]))

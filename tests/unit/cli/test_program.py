@@ -281,6 +281,17 @@ def test_empty_paths_are_refused_before_any_work(tmp_path, monkeypatch, words):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [(("1,2,3",), "name two points, or the corners of a polygon"),
+     (("1,2,3", "--volume", "0,0,0 1,0,0 1,0,1"), "name two points, or the corners of a polygon"),
+     (("--volume", "0,0,0 1,0"), "'1,0' is no point"), (("--volume", ""), "each corner is three finite numbers")],
+)  # fmt: skip
+def test_a_measurement_says_what_it_needs(tmp_path, words, says):
+    result = call("measure", tmp_path, *words)
+    assert result.exit_code == 2 and says in " ".join(result.stderr.split()), result.stderr
+
+
 def run_in_shell(script):
     return subprocess.run(
         ["sh", "-c", script.replace("APP", f"{sys.executable} -m sfm_app")], capture_output=True, text=True, check=False

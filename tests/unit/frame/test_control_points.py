@@ -1,5 +1,7 @@
 """Ground control points: their file, the fit with a deviation that covers the error, and wrong points."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -167,6 +169,67 @@ def test_the_deviation_of_the_scale_covers_its_error(count):
         normalized.append(np.log(found.from_model.scale / TRUE.scale) / found.deviation)
     assert 0.4 < np.std(normalized) < 1.3
     assert np.mean(np.abs(normalized) > 3) <= 0.02
+
+
+def with_checks(given, first):
+    """All points from the first one on as check points."""
+    points = [replace(one, name=f"{'CHK-' if k >= first else ''}{one.name}") for k, one in enumerate(given.points)]
+    return replace(given, points=tuple(points))
+
+
+@pytest.mark.parametrize(("noise_m", "mark_m"), [(0.02, 0.001), (0.0, 0.03)])
+@pytest.mark.parametrize("count", [4, 8])
+def test_the_deviation_of_check_points_covers_their_error(count, noise_m, mark_m):
+    rng, plan, height = np.random.default_rng(7), [], []
+    for _ in range(80):
+        given, located, places = survey(rng, count + 2, noise_m=noise_m)
+        given = with_checks(given, count)
+        spread = np.array([1.0, 3.0, 1.0]) * mark_m / TRUE.scale  # rays from above leave the height less sure
+        turn = TRUE.R.T
+        located = {
+            point.name: SightedPoint(
+                place + turn @ (spread * rng.normal(size=3)), turn @ np.diag(spread**2) @ turn.T, ("a", "b"), ()
+            )
+            for point, place in zip(given.points, places, strict=True)
+        }
+        for one in fit_control_points(given, located).surveyed[count:]:
+            plan.append(one.plan_m / one.plan_deviation_m)
+            height.append(one.height_m / one.height_deviation_m)
+    for normalized in (plan, height):
+        assert 0.4 < np.sqrt(np.mean(np.square(normalized))) < 1.2
+        assert np.mean(np.abs(normalized) > 3) <= 0.02
+
+
+def test_a_check_point_has_no_part_in_the_fit():
+    given, located, places = survey(np.random.default_rng(8), 7)
+    alone = fit_control_points(replace(given, points=given.points[:6]), located)
+    moved = TRUE(places[6]) + np.array([0.3, -0.4, 0.0])
+    (enu,) = LocalFrame(read_system("EPSG:32632"), UTM).positions(np.array([[moved[0], -moved[2], moved[1]]]))
+    checked = replace(given.points[6], name="chk-far", position=tuple(enu.tolist()))
+    found = fit_control_points(
+        replace(given, points=(checked, *given.points[:6])), located | {"chk-far": located["p6"]}
+    )
+    assert (found.from_model.t == alone.from_model.t).all() and found.from_model.scale == alone.from_model.scale
+    assert found.inliers == alone.inliers and not found.outliers and found.rms_m == alone.rms_m
+    far = found.surveyed[0]
+    assert (far.role, far.is_inside) == ("check", False)
+    assert far.plan_m == pytest.approx(0.3, abs=0.03) and far.height_m == pytest.approx(0.4, abs=0.03)
+    assert [(one.role, one.is_inside) for one in found.surveyed[1:]] == [("used", None)] * 6
+
+
+def test_check_points_alone_give_no_place_and_an_unsure_camera_widens_their_deviation():
+    given, located, _ = survey(np.random.default_rng(9), 6)
+    given = with_checks(given, 4)
+    located = {f"CHK-{name}" if name in ("p4", "p5") else name: sight for name, sight in located.items()}
+    assert "2 of 2 ground control points" in fit_control_points(replace(given, points=(*given.points[:2],
+                                                                given.points[4])), located)  # fmt: skip
+    located = {name: replace(sight, covariance=np.eye(3) * 1e-4) for name, sight in located.items()}
+    # two photos agree by chance: their marks are no better than those of the others
+    sharp = located | {"CHK-p4": replace(located["CHK-p4"], covariance=np.eye(3) * 1e-6, sigma_px=0.1)}
+    lucky, usual = (fit_control_points(given, places).surveyed[4] for places in (sharp, located))
+    assert lucky.plan_deviation_m == pytest.approx(usual.plan_deviation_m, rel=1e-6)
+    sure, unsure = (fit_control_points(given, located, shape).surveyed[4] for shape in (0.0, 0.05))
+    assert unsure.plan_deviation_m > 1.5 * sure.plan_deviation_m
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from sfm_app.frame.scale import MetricFrame, ScaleEvidence, agree, move_model
+from sfm_app.frame.scale import MetricFrame, ScaleEvidence, SurveyedPoint, agree, move_model
 from sfm_app.geometry.poses import Similarity
 from sfm_app.synthetic.cameras import axis_rotation
 from sfm_app.types import MapPlace
@@ -57,6 +57,7 @@ FRAME = MetricFrame(
     (ScaleEvidence("marker aruco-4x4 3", 3.5, 0.001, 4),),
     ("marker aruco-4x4 5 contradicts the 3 others",),
     MapPlace("EPSG:32632", (500_000.0, 4_649_000.0, 320.0), 12.0),
+    (SurveyedPoint("p1", "used", 3, 0.01, -0.02), SurveyedPoint("CHK-1", "check", 2, 0.01, -0.07, 0.01, 0.02)),
 )
 
 
@@ -65,6 +66,14 @@ def test_a_frame_is_read_back_as_it_was_written(frame):
     again = MetricFrame.from_dict(json.loads(json.dumps(frame.to_dict())))
     assert again.to_dict() == frame.to_dict() and again.place == frame.place
     assert again.is_metric == again.changes == (frame is FRAME)
+    assert again.surveyed == frame.surveyed
+
+
+@pytest.mark.parametrize(
+    ("plan", "height", "inside"), [(0.029, -0.059, True), (0.031, 0.0, False), (0.0, -0.061, False)]
+)
+def test_a_check_point_is_inside_three_deviations_in_plan_and_height(plan, height, inside):
+    assert SurveyedPoint("CHK-1", "check", 2, plan, height, 0.01, 0.02).is_inside is inside
 
 
 def test_moved_cameras_see_moved_points_where_they_saw_them(textured_ball):

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 import sfm_app
+from sfm_app.frame.scale import SurveyedPoint
 from sfm_app.report.findings import (
     ALL_PIXELS,
     LARGEST_PX,
@@ -21,6 +22,7 @@ from sfm_app.report.findings import (
     correlation_text,
     glance,
     picture_side,
+    survey_rows,
     unknown_cameras,
     value_text,
 )
@@ -66,6 +68,16 @@ def test_durations_are_said_in_a_fitting_unit(seconds, text):
 def test_a_value_has_its_deviation_only_where_it_is_known():
     assert value_text(1379.16, 1.05) == "1379.2 ± 1.1"
     assert value_text(-0.00076, None, 4) == "-0.0008"
+
+
+def test_control_points_and_check_points_stand_in_one_table_in_millimeters():
+    used = SurveyedPoint("p1", "used", 3, 0.0102, -0.02)
+    checks = [SurveyedPoint("CHK-1", "check", 2, 0.01, height, 0.01, 0.02) for height in (0.03, 0.07)]
+    assert survey_rows([used, *checks]) == [
+        ("p1", "used", "3", "10.2", "-20.0"),
+        ("CHK-1", "check, inside", "2", "10.0 ± 10.0", "30.0 ± 20.0"),
+        ("CHK-1", "check, outside", "2", "10.0 ± 10.0", "70.0 ± 20.0"),
+    ]
 
 
 def test_settings_that_were_changed_are_listed_with_their_defaults():

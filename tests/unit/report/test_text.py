@@ -9,7 +9,18 @@ import pytest
 
 from sfm_app.camera.bearings import field_of_view_deg
 from sfm_app.camera.models import camera_matrix
-from sfm_app.report.text import camera_texts, field_text, held_text, lens_text, result_lines, scene_lines, scene_summary
+from sfm_app.frame.volumes import Volume
+from sfm_app.report.text import (
+    camera_texts,
+    field_text,
+    held_text,
+    lens_text,
+    result_lines,
+    scale_lines,
+    scene_lines,
+    scene_summary,
+    volume_lines,
+)
 from sfm_app.settings import HYPOTHESES, HypothesisName
 from sfm_app.types import Calibration, CameraModel, Scene
 
@@ -169,6 +180,25 @@ def test_who_has_given_a_level_surface_reads_no_doubts_of_the_up_direction():
         "scene": {"counts": unsure}, "scale": {"counts": size | level}})) for level in ({}, {"level": 1})]  # fmt: skip
     assert "lie on its side" in texts[0] and "level surfaces" not in texts[0]
     assert "lie on its side" not in texts[1] and "upright by the level surfaces" in texts[1]
+
+
+def test_check_points_outside_of_their_deviations_are_named():
+    figures = {"inside": ["CHK-1", "CHK-2"], "outside": [], "plan_rms_m": 0.0123, "height_rms_m": 0.02}
+    size = {"unit": "meter", "deviation_percent": 0.1, "source": "x", "contradictions": [], "problems": []}
+    _, line = scale_lines(size | {"check_points": figures})
+    assert "2 of 2 check points lie inside three of their deviations: off by 1.23 cm in plan and 2 cm in height" in line
+    *_, first, second = scale_lines(size | {"check_points": figures | {"outside": ["CHK-3"]}})
+    assert "2 of 3 check points" in first and "beware" in second and "CHK-3" in second
+
+
+def test_volumes_have_deviations_and_name_what_is_missing():
+    volume = Volume(4.1, 0.5, 0.11, 0.07, 0.09, 16.0, 0.034, metric=True)
+    cut, fill, net, area, missing = volume_lines(volume)
+    assert "above the plane (cut)" in cut and "4.1 +- 0.11 m3" in cut
+    assert "0.5 +- 0.07 m3" in fill and "3.6 +- 0.09 m3" in net and "16 m2" in area
+    assert "3.4 % of the area has no surface" in missing
+    *_, unit = volume_lines(replace(volume, missing=0.0, metric=False))
+    assert "the model's own unit" in unit and "m3" not in "".join(volume_lines(replace(volume, metric=False)))
 
 
 def test_a_failed_adjustment_is_named():
