@@ -34,12 +34,14 @@ ABOUT = (
     "orthophoto are off across themselves, on the ground and at roofs (steps of a meter); found: edges that are alike. "
     "Heights: share of the DSM within 1.5 pixels, median, 90 % of the sizes, and the bending of the whole (dome). "
     "Moved: after the best shift, or without the median, which come from the noise of the positions. Up: its source, "
-    "and its error in degrees in the model; control points then level the raster."
+    "and its error in degrees in the model; control points then level the raster. Ground: the DTM against the hills. "
+    "Checks: four points that have no part in the fit, and the root mean squares by which they are off."
 )
 COLUMNS = (
     "by", "seed", "photos", "pixel cm", "found %", "edges median", "edges 90 %", "roofs median", "roofs 90 %",
     "edges moved 90 %", "covered %", "within 1.5 px %", "moved", "height median", "height |90 %|", "dome", "up",
-    "up deg", "ground open %", "ground within 20 cm %", "DSM within 20 cm %", "CPU s of the maps", "failed",
+    "up deg", "ground open %", "ground within 20 cm %", "DSM within 20 cm %", "checks inside", "plan cm",
+    "height cm", "CPU s of the maps", "failed",
 )  # fmt: skip
 NOISE_M = 0.05
 HEIGHT_M = 30.0
@@ -78,7 +80,7 @@ def measure(by: str, seed: int, args: argparse.Namespace) -> Row:
             return row | {"failed": said}
         if product == "dsm":
             row["CPU s of the maps"] = _spent() - begun
-    row |= _up_error(out, views)
+    row |= _up_error(out, views) | _check_points(out)
     return row if by == "none" else row | _compare(out, scene, args)
 
 
@@ -90,6 +92,20 @@ def _up_error(out: Path, views: Views) -> Row:
     counts = json.loads((out / "manifest.json").read_text(encoding="utf-8"))["stages"]["scene"]["counts"]
     error = float(np.degrees(np.arctan2(np.hypot(up[0], up[2]), up[1])))
     return {"up": counts["orientation"]["up"], "up deg": error}
+
+
+def _check_points(out: Path) -> Row:
+    """Return how many check points lie inside three of their deviations, and how far they are off; empty without."""
+    counts = json.loads((out / "manifest.json").read_text(encoding="utf-8"))["stages"]["scale"]["counts"]
+    checks = counts.get("check_points")
+    if checks is None:
+        return {}
+    inside = f"{len(checks['inside'])} of {len(checks['inside']) + len(checks['outside'])}"
+    return {
+        "checks inside": inside,
+        "plan cm": 100.0 * checks["plan_rms_m"],
+        "height cm": 100.0 * checks["height_rms_m"],
+    }
 
 
 def _spent() -> float:

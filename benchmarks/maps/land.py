@@ -117,12 +117,15 @@ def write_positions(file: Path, views: Views, noise_m: float, seed: int) -> None
 
 
 def write_control_points(file: Path, scene: SyntheticScene, views: Views, side: float, seed: int) -> None:
-    """Write eight points on the ground, marked in all photos that see them, half a pixel off."""
+    """Write eight points and four that check, on the ground, marked in all photos that see them, half a pixel off."""
     rng, surface = np.random.default_rng([seed, 61]), ray_caster(scene.vertices, scene.faces)
-    angle = np.pi / 4.0 * np.arange(8)
-    places = 0.38 * side * np.column_stack([np.cos(angle), np.sin(angle)]) * np.array([1.0, 0.5] * 4)[:, None]
+    angle = np.pi / 4.0 * np.arange(12)
+    rings = np.array([0.38, 0.19] * 4 + [0.3] * 4)
+    angle[8:] = np.pi / 8.0 + np.pi / 2.0 * np.arange(4)
+    places = side * rings[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
     lines = [SYSTEM]
     for number, (x, z) in enumerate(places):
+        role = "point" if number < 8 else "CHK-"
         fall = cast_rays(surface, np.array([x, 100.0, z]), np.array([[0.0, -1.0, 0.0]]))["t_hit"]
         point = np.array([x, 100.0 - float(fall[0]), z])
         east, north, up = on_map(point[None])[0]
@@ -133,7 +136,7 @@ def write_control_points(file: Path, scene: SyntheticScene, views: Views, side: 
             hidden = cast_rays(surface, center, (point - center)[None])["t_hit"][0] < 0.999
             if 20.0 < u < camera.width - 20.0 and 20.0 < v < camera.height - 20.0 and not hidden:
                 u, v = np.array([u, v]) + rng.normal(scale=0.5, size=2)
-                lines.append(f"{east:.4f} {north:.4f} {up:.4f} {u:.2f} {v:.2f} {name} point{number}")
+                lines.append(f"{east:.4f} {north:.4f} {up:.4f} {u:.2f} {v:.2f} {name} {role}{number}")
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
