@@ -20,7 +20,7 @@ from typing import Any
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.files import read_object, replace_atomically
 from sfm_app.photos.files import EXTENSIONS, list_photos
-from sfm_app.photos.masks import MASK_HINT, find_mask
+from sfm_app.photos.masks import find_mask
 from sfm_app.settings import Settings, toml_value
 
 RECORD, SETTINGS, LIST, DRAFT = "project.json", "settings.toml", "photos.txt", ".upload-"
@@ -148,7 +148,9 @@ class Project:
         photos = self.photos()
         photo = name if name in photos else next((one for one in photos if find_mask(one, {name})), "")
         if not photo:
-            raise InputError(f"{name} is the mask of no photo here", hint=MASK_HINT)
+            raise InputError(
+                f"{name} is the mask of no photo here", hint="name it as its photo: a_mask.png belongs to a.jpg"
+            )
         return self.masks / f"{photo}.png"
 
     def note_masks(self) -> None:
