@@ -41,6 +41,7 @@ const says = (text) => until(`"${text}"`, (wanted) => document.querySelector(".s
 const settled = () => until("minutes known", () => document.querySelector("#quality option")?.textContent.includes("–"));
 async function give(some, where = "") { // as a file manager does
   const zone = page.locator(`${where} .drop`).first();
+  await page.waitForTimeout(1500); // parts of a finished page change places
   await zone.scrollIntoViewIfNeeded();
   const { x, y } = await zone.boundingBox(), data = { items: [], files: some, dragOperationsMask: 1 };
   for (const type of ["dragEnter", "dragOver", "drop"]) await client.send("Input.dispatchDragEvent", { type, x: x + 40, y: y + 20, data });
