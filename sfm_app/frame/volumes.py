@@ -1,6 +1,5 @@
 """Volumes of a surface above and below a plane, within a polygon."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,7 +87,7 @@ def measure_volume(corners: FloatArray, surface: Surface, model: Sightlines, dev
     errors = _Errors(corners, flat, axes[2], model)
     shown = np.column_stack([places[seen], heights[seen]]) @ axes + middle
     sigma = errors.surface_sigma(shown)
-    edges = heights[tuple(_edge_cells(flat[:, :2], low, cell, shape))]
+    edges = heights[_edge_cells(flat[:, :2], low, cell, shape)]
     values, deviations = list[float](), list[float]()
     for sign, clip in ((1.0, True), (-1.0, True), (1.0, False)):
         value = step * float(np.maximum(sign * each, 0.0).sum() if clip else each.sum())
@@ -205,10 +204,9 @@ def _fill_holes(heights: FloatArray) -> FloatArray:
 
 def _edge_cells(
     polygon: FloatArray, low: FloatArray, cell: float, shape: tuple[int, ...]
-) -> Iterator[NDArray[np.int64]]:
-    """Yield rows and columns (N, EDGE_SAMPLES) of cells along the edges of a polygon (N, 2)."""
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return rows and columns (N, EDGE_SAMPLES) of cells along the edges of a polygon (N, 2)."""
     share = np.linspace(0.0, 1.0, EDGE_SAMPLES)[None, :, None]
     along = (1 - share) * polygon[:, None] + share * np.roll(polygon, -1, axis=0)[:, None]
     columns, rows = np.moveaxis(((along - low) / cell).astype(np.int64), -1, 0)
-    yield np.clip(rows, 0, shape[0] - 1)
-    yield np.clip(columns, 0, shape[1] - 1)
+    return np.clip(rows, 0, shape[0] - 1), np.clip(columns, 0, shape[1] - 1)

@@ -4,7 +4,7 @@ import sqlite3
 import struct
 from collections.abc import Iterable, Iterator
 from contextlib import closing
-from math import ceil, floor, log10
+from math import ceil, floor
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from sfm_app.errors import InputError
 from sfm_app.files import replace_atomically
 from sfm_app.maps.drawing import Grid, Tile, assemble
+from sfm_app.maps.sheets import floor_to_usual
 from sfm_app.types.arrays import FloatArray
 
 Contour = tuple[float, FloatArray]
@@ -19,6 +20,8 @@ Contour = tuple[float, FloatArray]
 
 LEVELS, MOST_LEVELS = 20, 10_000
 """Least number of heights by default, and the most. By hand: readable on a screen, and a typing error."""
+LEAST_M = 1e-9
+"""Reach of level ground, whose lines need some step. By definition: rounding."""
 PERCENT = (1.0, 99.0)
 """Heights between which these levels lie, in percent of all pixels. Chosen by hand: borders have outliers."""
 MOST_PIXELS = 16e6
@@ -60,7 +63,7 @@ def find_contours(tiles: Iterable[Tile], grid: Grid, interval: float = 0.0) -> I
     known = heights[np.isfinite(heights)]
     if not len(known):
         return
-    step = interval or _round_interval(float(np.ptp(np.percentile(known, PERCENT))))
+    step = interval or floor_to_usual(max(float(np.ptp(np.percentile(known, PERCENT))), LEAST_M) / LEVELS)
     first, last = ceil(known.min() / step), floor(known.max() / step)
     if last - first > MOST_LEVELS:
         raise InputError(f"contours would have {last - first} heights", hint="name a larger --interval")
@@ -70,13 +73,6 @@ def find_contours(tiles: Iterable[Tile], grid: Grid, interval: float = 0.0) -> I
     for level in range(first, last + 1):
         for line in found.lines(level * step):
             yield level * step, np.asarray(line, np.float64)
-
-
-def _round_interval(reach: float) -> float:
-    """Return the largest 1, 2 or 5 times a power of ten with `LEVELS` heights or more on a reach."""
-    most = max(reach, 1e-9) / LEVELS
-    power = 10.0 ** floor(log10(most))
-    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= most * (1.0 + 1e-9)))
 
 
 def write_geopackage(contours: Iterable[Contour], wkt: str, target: Path) -> None:

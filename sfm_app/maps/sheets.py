@@ -93,7 +93,7 @@ def compose(picture: ByteArray, pixel: float, caption: Caption, legend: str) -> 
         image = image.resize((width * enlarge, height * enlarge), Image.Resampling.BICUBIC)
     margin, line = (max(round(length / INCH_M * dpi), 1) for length in (MARGIN_M, LINE_M))
     font = ImageFont.load_default(line)
-    bar = _bar_length(BAR_SHARE * image.width * pixel)
+    bar = floor_to_usual(BAR_SHARE * image.width * pixel)
     texts = [f"{caption.product}, {caption.title}, pixels of {_length(pixel * enlarge, caption.unit_m)}"]
     texts[0] += f", 1 : {scale} on this page" if scale else ", size unknown"
     texts += [legend] if legend else []
@@ -133,7 +133,7 @@ def _ceil_to_usual(value: float) -> float:
     return float(next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= value * (1.0 - 1e-9)))
 
 
-def _bar_length(most: float) -> float:
+def floor_to_usual(most: float) -> float:
     """Return the largest 1, 2 or 5 times a power of ten that is not above a value > 0."""
     return 1.0 / _ceil_to_usual(1.0 / most)
 

@@ -377,7 +377,8 @@
     const { clientWidth: width, clientHeight: height } = canvas;
     eye.updateMatrixWorld(); // it may have moved since the last frame
     ray.setFromCamera({ x: (2 * x) / width - 1, y: 1 - (2 * y) / height }, eye);
-    const hit = model?.visible ? ray.intersectObject(model, true)[0] : undefined;
+    const isDrawn = (point) => planes.every((plane) => plane.distanceToPoint(point) >= 0);
+    const hit = model?.visible ? ray.intersectObject(model, true).find((one) => isDrawn(one.point)) : undefined;
     if (hit) return hit.point;
     if (!points.visible) return null;
     const at = new THREE.Vector3(), toScreen = new THREE.Matrix4().multiplyMatrices(eye.projectionMatrix, eye.matrixWorldInverse);
@@ -385,9 +386,10 @@
     for (const cloud of points.children) {
       const all = cloud.geometry.getAttribute("position");
       for (let k = 0; k < all.count; k += 1) {
-        at.fromBufferAttribute(all, k).applyMatrix4(toScreen);
+        const isHidden = !isDrawn(at.fromBufferAttribute(all, k));
+        at.applyMatrix4(toScreen);
         const off = Math.hypot(((at.x + 1) / 2) * width - x, ((1 - at.y) / 2) * height - y);
-        if (Math.abs(at.z) < 1 && off < NEAR_PX && at.z < least) { least = at.z; best = new THREE.Vector3().fromBufferAttribute(all, k); }
+        if (!isHidden && Math.abs(at.z) < 1 && off < NEAR_PX && at.z < least) { least = at.z; best = new THREE.Vector3().fromBufferAttribute(all, k); }
       }
     }
     return best;
